@@ -209,6 +209,27 @@ async def test_landing_ordered_before_member_starts_is_not_overruled(is_posted: 
         assert stage.modes_ordered("north/2") == ["LAND"]
 
 
+async def test_older_flight_of_same_moment_is_not_sent() -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
+        await stage.take_off()
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        flight, hold = await asyncio.gather(stage.fleet.go_to(targets), stage.fleet["north/2"].hold())
+        assert "got a newer order before it started" in str(flight.failed["north/2"])
+        assert hold.is_complete
+        assert [order.command for _, order in stage.orders_to("north/2")] == [MavCmd.DO_SET_MODE]
+
+
+async def test_newer_flight_overrules_function_of_same_moment() -> None:
+    async def land(member: Member) -> None:
+        await member.vehicle.land()
+
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        _, flight = await asyncio.gather(stage.fleet.do(land), stage.fleet.go_to(targets))
+        assert flight.is_complete
+
+
 async def test_newer_flight_overrules_landing_of_same_moment() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
@@ -276,3 +297,13 @@ async def test_following_does_not_overrule_landing_of_same_moment(by_fleet: bool
             with pytest.raises(SetpointStreamStopped, match="north/2 got a newer order before it started"):
                 following.raise_if_stopped()
         assert stage.modes_ordered("north/2") == ["LAND"]
+
+
+async def test_following_left_at_once_is_no_running_action() -> None:
+    """Its task is cancelled before it begins."""
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        async with stage.fleet.following(Formation.line(["north/2"], 8.0, frame="north"), leader="north/1"):
+            pass
+        assert not stage.fleet._context.actions
+        assert not stage.orders_to("north/2")

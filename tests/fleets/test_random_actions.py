@@ -37,7 +37,8 @@ TAKEOVER_S = 2.0
 """Seconds until every order given to a member has noticed that its pilot took over."""
 ENDING = {"land": "land", "return_to_launch": "return", "hold": "hold"}
 """Calls that end a flight, and what they order."""
-MODES = {"9": "land", "6": "return", "17": "hold", "4.6": "land", "4.5": "return", "4.3": "hold"}
+COPTER_MODES = {"9": "land", "6": "return", "17": "hold"}
+PX4_MODES = {"4.6": "land", "4.5": "return", "4.3": "hold"}
 COMMANDS = (
     MavCmd.DO_SET_MODE,
     MavCmd.NAV_TAKEOFF,
@@ -48,11 +49,11 @@ COMMANDS = (
 SETPOINTS = (m.SetPositionTargetLocalNed, m.SetPositionTargetGlobalInt)
 
 
-def kind_of(message: m.CommandLong | m.CommandInt) -> str:
+def kind_of(message: m.CommandLong | m.CommandInt, modes: dict[str, str]) -> str:
     """Say what a command orders."""
     if message.command == MavCmd.DO_SET_MODE:
         number = f"{message.param2:g}" + (f".{message.param3:g}" if message.param3 else "")
-        return MODES.get(number, f"mode {number}")
+        return modes.get(number, f"mode {number}")
     if message.command == MavCmd.COMPONENT_ARM_DISARM:
         return "arm" if message.param1 else "disarm"
     is_hold = isinstance(message, m.CommandLong) and math.isnan(message.param5)
@@ -317,9 +318,9 @@ class RandomFlight:
 
     def judge(self, name: str) -> None:
         simulated, pilot_at = self.simulated[name], self.pilots.get(name)
-        number = simulated.system_id
+        number, modes = simulated.system_id, PX4_MODES if isinstance(simulated, SimulatedPx4) else COPTER_MODES
         sent = [
-            (index, at, "setpoint" if isinstance(message, SETPOINTS) else kind_of(message))
+            (index, at, "setpoint" if isinstance(message, SETPOINTS) else kind_of(message, modes))
             for index, (at, message) in enumerate(self.wire.sent)
             if isinstance(message, SETPOINTS)
             or (isinstance(message, (m.CommandLong, m.CommandInt)) and message.command in COMMANDS)

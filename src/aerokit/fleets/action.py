@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import math
-from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from fnmatch import fnmatchcase
 from functools import partial
@@ -87,15 +85,12 @@ class FleetAction:
         self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
         self._moves_members, self._arms, self._corridors = moves_members, arms, corridors
-        self._moves: Counter[str] = Counter()  # `FleetContext.moves` when the action began
-        self._newer_actions: list[FleetAction] = []  # actions that move members and began while this one was running
+        self._newer_actions: list[FleetAction] = []  # newer actions that move members
         requested = list(members)
         for member in requested:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
-        self._number = next(context.action_numbers)
         self._newer_order_checks = {member.name: self._newer_order_check(member) for member in self._members}
-        self._starts = Counter(context.starts)
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
@@ -113,36 +108,31 @@ class FleetAction:
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
+        # The order of creation decides which action is newer. `run` may begin later.
+        if moves_members:
+            for action in context.actions:
+                action._newer_actions.append(self)
+            context.newest_moves.update(dict.fromkeys((member.name for member in self._members), self))
+        context.actions[self] = None
 
     async def run(self) -> FleetResult:
         """Execute the action with all members concurrently, until every member has finished, failed or was stopped."""
-        if self._context.is_closed:
-            raise ConnectionClosed(f"{self.name}: {FLEET_CLOSED}")
-        if not self._members:
-            return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
-        for action in self._context.actions:
-            older, newer = (self, action) if action._number > self._number else (action, self)
-            if newer._moves_members:
-                older._newer_actions.append(newer)
-        was_called_late = bool(self._newer_actions)
-        if self._moves_members:
-            self._context.moves.update(member.name for member in self._members)
-        self._moves = Counter(self._context.moves)
-        self._context.actions.append(self)
         try:
+            if self._context.is_closed:
+                raise ConnectionClosed(f"{self.name}: {FLEET_CLOSED}")
+            if not self._members:
+                return self.result_so_far()
             delays_s = {} if self._corridors is None else self._corridors.delays_s
             for index, member in enumerate(self._members):
                 delay_s = index * self._stagger_s + delays_s.get(member.name, 0.0)
-                tasks.start(
-                    partial(self._run_member, member, delay_s, was_called_late), f"aerokit {self.name} {member.name}"
-                )
+                tasks.start(partial(self._run_member, member, delay_s), f"aerokit {self.name} {member.name}")
             await self._finished.wait()
         except BaseException:
             self._hold_finished_members()
             raise
         finally:
-            self._context.actions.remove(self)
+            self._context.actions.pop(self, None)
             await tasks.aclose()
         if self.program_error is not None:
             self._hold_finished_members()
@@ -151,13 +141,11 @@ class FleetAction:
         return self.result_so_far()
 
     @property
-    def orders(self) -> dict[str, str]:
-        """The policy's orders by member name. Empty if no member failed, or if the policy lets the others continue."""
+    def policy_orders(self) -> dict[str, str]:
         return dict(self._policy_orders)
 
     @property
-    def active(self) -> tuple[str, ...]:
-        """The names of the members that are executing the action."""
+    def active_names(self) -> tuple[str, ...]:
         return tuple(
             member.name
             for member in self._members
@@ -165,7 +153,6 @@ class FleetAction:
         )
 
     def result_so_far(self) -> FleetResult:
-        """Return a result with the members that have finished so far."""
         names = [member.name for member in self._members]
         # The outcomes have the order of the members, not the order in which the members have finished.
         outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
@@ -174,14 +161,13 @@ class FleetAction:
         return result
 
     def close(self) -> None:
-        """End the action with the fleet's block: members that still execute it fail, and their tasks are cancelled."""
+        """Fail the members that still execute the action, and cancel their tasks."""
         for member in self._members:
             if member.name not in self._outcomes:
                 self._record_failure(member, ConnectionClosed(f"{self.name}: {FLEET_CLOSED}"))
                 self._cancel_tasks_of([member])
 
     def on_member_unavailable(self, member: Member) -> None:
-        """Record that the member has failed because it was lost or taken over."""
         if member not in self._members or self._has_failed_or_stopped(member):
             return
         error_class = HeartbeatTimeout if member.state is MemberState.LOST else OperationRejected
@@ -189,23 +175,17 @@ class FleetAction:
 
     # --------------------------------------------------------------------------------- one member
 
-    async def _run_member(self, member: Member, delay_s: float, was_called_late: bool) -> None:
-        """Execute the action with one member after a delay, and record its outcome.
-
-        A member that got a newer order after the action was created does not start. ``was_called_late`` is True if
-        the action runs only after the begin of a newer one, which then counts as such an order.
-        """
+    async def _run_member(self, member: Member, wait_s: float) -> None:
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
         try:
             if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
-            has_newer_order, wait_s = self._newer_order_checks[member.name], delay_s
-            if self._context.starts[member.name] != self._starts[member.name]:  # An older action may have ordered this.
-                has_newer_order = self._newer_order_check(member)
+            has_newer_order = self._newer_order_checks.get(member.name) or self._newer_order_check(member)
             is_overruled = (self._moves_members or self._arms) and (
-                has_newer_order() or (was_called_late and self._has_newer_action(member))
+                # A landing of the same moment is sent in any case, because the newer action may fail.
+                has_newer_order() or (not self._is_safe and self._has_newer_action(member))
             )
             while wait_s > START_TOLERANCE_S and not is_overruled:
                 await self._wait_to_start(member, wait_s)
@@ -218,7 +198,8 @@ class FleetAction:
                     f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
                 )
             self._last_start_at = self._context.now()
-            self._context.starts[member.name] += 1
+            for action in self._context.actions:  # Those that begin later are newer than what this action orders.
+                action._newer_order_checks.pop(member.name, None)
             if not member.is_available:
                 raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
             value = await self._execute_in_time(member)
@@ -232,20 +213,16 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                self._final_orders[member.name] = _newest_order(member), self._moves[member.name]
+                self._final_orders[member.name] = _newest_order(member), self
                 member.record_success()
         finally:
             del self._tasks[member.name]
             self._check_finished()
 
     async def _wait_to_start(self, member: Member, delay_s: float) -> None:
-        """Wait ``delay_s`` before a member's order, and then for its next HEARTBEAT if the last one is not recent.
+        """Wait ``delay_s`` and for a recent HEARTBEAT.
 
-        Raises:
-            OperationRejected: the computer slept during the wait, the member is unavailable, or it would start too late
-                in its corridor. A member that was unavailable during the wait has failed, so it is rejected, too,
-                unless the action is safe (such as a landing).
-            HeartbeatTimeout: the member is silent.
+        Raises OperationRejected or HeartbeatTimeout if the member must not start after this wait.
         """
         connection, name = member.vehicle.connection, member.name
         began_at, absences = connection.now(), member.absences
@@ -256,6 +233,7 @@ class FleetAction:
         member.refresh()
         if not member.is_available:
             raise OperationRejected(f"{self.name}: {name} is {member.status}")
+        # A member that was unavailable during the wait has failed, which must not keep it from landing.
         if member.absences > absences and not self._is_safe:
             raise OperationRejected(f"{self.name}: {name} was unavailable before it started; nothing was sent to it")
         late_s = connection.now() - began_at - delay_s
@@ -266,20 +244,14 @@ class FleetAction:
         return member.name in self._failed or member.name in self._stopped
 
     def _has_newer_order(self, member: Member) -> bool:
-        """Return True if the program has given the member a newer order. This action must then send no other order.
-
-        This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
-        vehicle to land or to return.
-        """
+        """Return True if a newer action moves the member, or the program has told it to land or return."""
         # The landing may also be a part of the action, if it is a function of the program that still runs.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
         return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
 
     def _has_newer_action(self, member: Member) -> bool:
-        """Return True if a newer action of the fleet moves the member or has moved it.
-
-        If this action arms its members, only newer actions that end the flight count, such as a landing.
-        """
+        """Return True if a newer action of the fleet moves the member or has moved it."""
+        # An action that arms is overruled only by newer actions that end the flight, such as a landing.
         return any(
             member in action._members and not action._has_failed_or_stopped(member)
             for action in self._newer_actions
@@ -287,9 +259,9 @@ class FleetAction:
         )
 
     def _newer_order_check(self, member: Member) -> Callable[[], bool]:
-        """Return a function that tells whether the program has given the member certain orders after this call.
+        """Return a function that tells whether the program has told the member to land, return or disarm meanwhile.
 
-        They are orders to land, to return or to disarm and, if this action arms the members, to arm.
+        If this action arms the members, orders to arm count, too.
         """
         arbiter, order_before = member.vehicle._arbiter, _newest_order(member)
 
@@ -313,11 +285,7 @@ class FleetAction:
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _record_failure(self, member: Member, error: Exception) -> None:
-        """Record that a member failed, and ask the policy for orders to the other members.
-
-        The policy is not asked again once it has given orders in this action. It is never asked if the action is a safe
-        one (such as a landing), if the member is released, or after the fleet's block has ended.
-        """
+        """Record that a member failed, and ask the policy for orders to the other members."""
         if member.name in self._failed:
             return
         self._failed[member.name] = error
@@ -332,14 +300,13 @@ class FleetAction:
         if len(self._undecided) > 1:
             return
         while self._undecided:
-            if self._policy_trigger is None:
+            if self._policy_trigger is None:  # The policy has not given orders in this action yet.
                 self._apply_policy(*self._undecided[0])
             del self._undecided[0]
 
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
-        """Ask the policy about a failure. Send its orders, and cancel the running actions of members with orders."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
@@ -389,7 +356,6 @@ class FleetAction:
             self._publish_completed()
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
-        """Return the policy's orders. If the policy function raises an error, all other members are ordered to hold."""
         try:
             return self._context.rules.decide(failure)
         except Exception as error:
@@ -409,7 +375,6 @@ class FleetAction:
                 task.cancel()
 
     async def _send_order(self, member: Member, order: PolicyOrder) -> None:
-        """Send an order of the policy to a member, and wait until the member has carried it out."""
         try:
             if order == "land":
                 await member.vehicle.land()
@@ -448,7 +413,6 @@ class FleetAction:
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:
-        """End `run` once every member has an outcome and all orders of the policy have ended."""
         if not self._tasks and not self._pending_policy_orders and len(self._outcomes) == len(self._members):
             self._finished.set()
 
@@ -458,12 +422,12 @@ class FleetAction:
 
 
 def _newest_order(member: Member) -> Order | None:
-    """Return the newest order of this program that flies the vehicle; None if there is none."""
+    """Return the newest order of this program that moves the vehicle."""
     return member.vehicle._arbiter.latest(STEERING)
 
 
 def _is_ending_flight(member: Member) -> bool:
-    """Return True if this program ordered the vehicle to land or return, and the order is still valid."""
+    """Return True while an order of this program to land or return is valid."""
     newest = _newest_order(member)
     # A posted order that was closed still flies the vehicle.
     return newest is not None and newest.ends_flight and newest.is_newest and not newest.takeover_reason
@@ -488,10 +452,8 @@ class FleetContext:
         self.min_distance_m: float | None = min_distance_m
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
-        self.actions: list[FleetAction] = []
-        self.action_numbers: Iterator[int] = itertools.count()
-        self.moves: Counter[str] = Counter()  # how many actions that move each member were given
-        self.starts: Counter[str] = Counter()  # how many actions each member has started
+        self.actions: dict[FleetAction, None] = {}  # those that have not ended, the newest last
+        self.newest_moves: dict[str, FleetAction] = {}  # the newest action that moves each member
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
         # The missions of the upload that began last; empty if an older upload may have replaced one of them.
         self.newest_upload: Mapping[str, Mission] = {}
@@ -513,15 +475,12 @@ class FleetContext:
         self.bus.publish(event)
 
     def newest_orders(self, member: Member) -> tuple[object, object]:
-        """Return a value that changes with each move that the program orders, to be compared with an earlier one.
-
-        It is the newest order that flies the member, and how many actions it was given. An action counts before it
-        gives an order.
-        """
-        return _newest_order(member), self.moves[member.name]
+        """Return a value that changes whenever the program orders the member to move."""
+        # An action that moves the member counts before it gives an order.
+        return _newest_order(member), self.newest_moves.get(member.name)
 
     def hold(self, member: Member, task_name: str) -> None:
-        """Order a member to hold, in the background. If the order fails, the member's state becomes FAILED."""
+        """Order a member to hold, without waiting for it."""
 
         async def hold() -> None:
             try:
@@ -532,10 +491,9 @@ class FleetContext:
         self.background.start(hold, task_name)
 
     def matching(self, *patterns: str) -> list[str]:
-        """Return the names of members that match any of these names or patterns (``"north/*"``).
+        """Return the names of the members that match a name or a pattern such as ``north/*``.
 
-        Raises:
-            InvalidArgument: a pattern matches no member.
+        Raises InvalidArgument if a pattern matches no member.
         """
         matching: dict[str, None] = {}  # an ordered set
         for pattern in patterns:
@@ -595,13 +553,12 @@ class SelectionBase:
 
     @staticmethod
     def _check_available(member: Member, action: str, consequence: str) -> None:
-        """Raise OperationRejected if the member is unavailable now."""
         member.refresh()
         if not member.is_available:
             raise OperationRejected(f"{action}: {member.name} is {member.status}; {consequence}")
 
     def _check_not_ordered_since(self, orders: Mapping[str, object], action: str, consequence: str) -> None:
-        """Raise OperationRejected if a member was given an order since `newest_orders` returned ``orders``."""
+        """Raise OperationRejected if `newest_orders` of a member has changed."""
         for name, order in orders.items():
             if self._context.newest_orders(self._context.members[name]) != order:
                 raise OperationRejected(f"{action}: {name} got a newer order meanwhile; {consequence}")
@@ -623,11 +580,8 @@ class SelectionBase:
         is_function: bool = False,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
-        """Execute an action with all members of the selection, or with those in ``names``.
-
-        ``is_function`` is True if the action is a function of the program, whatever its name.
-        """
         members = [member for member in self if names is None or member.name in names]
+        # A function of the program may have the name of a built-in action.
         built_in_action = "" if is_function else name
         is_safe = built_in_action in FLIGHT_ENDING_ACTIONS
         return await FleetAction(

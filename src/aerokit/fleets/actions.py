@@ -207,7 +207,7 @@ class Actions(SelectionBase):
 
 
 def _method(member: Member, name: str) -> Callable[..., Awaitable[Any]]:
-    """Return a public method of a member's vehicle or of a part of the vehicle (``"mission.resume"``)."""
+    """Return a public method of the vehicle or of one of its parts (``"mission.resume"``)."""
     method: Any = None
     is_public = not any(part.startswith("_") for part in name.split("."))
     if is_public:

@@ -28,9 +28,7 @@ RESET_FACTOR = 1.2
 def position_of(member: Member, max_age_s: float = POSITION_MAX_AGE_S) -> Position:
     """Return the position of a member.
 
-    Raises:
-        ValueUnknownError, StaleValueError: the position is unknown or older than ``max_age_s``; the text names the
-            member.
+    Raises ValueUnknownError, with the member's name in its text, if the position is unknown or too old.
     """
     try:
         return member.vehicle.position.fresh(max_age_s)
@@ -42,10 +40,7 @@ def altitude_amsl(member: Member, target: Position) -> float:
     """Return a target's altitude above sea level in metres, for this member.
 
     A relative altitude counts from the member's home. A target without an altitude has the member's present altitude.
-
-    Raises:
-        ValueUnknownError, StaleValueError: the target has no altitude above sea level, and the member's position or one
-            of its altitudes is unknown or old.
+    Raises ValueUnknownError if an altitude of the member is needed and unknown.
     """
     if target.altitude_amsl_m is not None:
         return target.altitude_amsl_m
@@ -77,12 +72,7 @@ class LocalOrigin:
         position = self._origin.offset(north_m=north_m, east_m=east_m)
         return Position(position.latitude_deg, position.longitude_deg, altitude_amsl_m=altitude_amsl_m)
 
-    def of_member(self, member: Member) -> LocalPoint:
-        """Return the current position of a member.
-
-        Raises:
-            ValueUnknownError, StaleValueError: the position is unknown.
-        """
+    def local_position_of(self, member: Member) -> LocalPoint:
         position = position_of(member)
         return self.to_local(position, altitude_amsl(member, position))
 
@@ -104,7 +94,6 @@ class DistanceMonitor:
             await anyio.sleep(POLL_INTERVAL_S)
 
     def check(self) -> None:
-        """Handle the pairs that have come too close since the last call."""
         points = to_local_points(self._flying_positions())
         near_pairs = pairs_within(points, RESET_FACTOR * self._min_distance_m)
         # Pairs that are apart again can be reported again.
@@ -115,10 +104,7 @@ class DistanceMonitor:
                 self._on_too_close(self._context.members[first], self._context.members[second], distance_m)
 
     def _flying_positions(self) -> dict[str, tuple[float, float, float]]:
-        """Return latitude, longitude and altitude of members in the air, including those that a pilot controls.
-
-        Members whose position is unknown or older than `POSITION_MAX_AGE_S` cannot be compared.
-        """
+        """Return latitude, longitude and altitude above sea level of each member in the air."""
         positions: dict[str, tuple[float, float, float]] = {}
         for member in self._context.members.values():
             vehicle = member.vehicle
@@ -130,7 +116,6 @@ class DistanceMonitor:
         return positions
 
     def _on_too_close(self, first: Member, second: Member, distance_m: float) -> None:
-        """Publish TooClose. Members that this program flies are ordered to hold, unless only reports are wanted."""
         pair = (first, second)
         for member in pair:
             member.refresh()

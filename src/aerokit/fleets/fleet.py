@@ -57,7 +57,6 @@ class Selection(Actions, Missions, Formations, Shows):
         return self._select("role", name)
 
     def _select(self, attribute: str, value: str) -> Selection:
-        """Select the members whose attribute (``group`` or ``role``) has this value."""
         selected = tuple(member.name for member in self if getattr(member, attribute) == value)
         if not selected:
             existing = dict.fromkeys(getattr(member, attribute) for member in self if getattr(member, attribute))
@@ -212,7 +211,6 @@ class Fleet(Selection):
         return Subscription(attach, capacity=capacity, overflow=overflow)
 
     def _attach_member_events(self, event_type: type[Event], sink: Sink) -> list[Detach]:
-        """Pass events of vehicles and links to a sink, as `MemberEvent` with the name of the member or network."""
         members = self._context.members.values()
         member_names = {(member.network, member.vehicle.system_id): member.name for member in members}
 

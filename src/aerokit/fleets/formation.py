@@ -151,8 +151,7 @@ def follow_velocity(
 def _heading_for(formation: Formation, leader: Member, max_age_s: float) -> float | None:
     """Return the leader's heading if the formation turns with it, otherwise None.
 
-    Raises:
-        ValueUnknownError, StaleValueError: the heading is needed and unknown, or older than ``max_age_s``.
+    Raises ValueUnknownError if the heading is needed and unknown or too old.
     """
     if formation.frame != "heading":
         return None
@@ -160,6 +159,12 @@ def _heading_for(formation: Formation, leader: Member, max_age_s: float) -> floa
         return leader.vehicle.heading_deg.fresh(max_age_s)
     except ValueUnknownError as error:
         raise type(error)(f"{leader.name}: {error}") from None
+
+
+def _check_leader(leader: Member) -> None:
+    leader.refresh()
+    if not leader.is_available:
+        raise OperationRejected(f"the leader {leader.name} is {leader.status}")
 
 
 @checks_arguments
@@ -227,7 +232,7 @@ class Following:
     async def __aenter__(self) -> Self:
         if self._was_entered:
             raise BusyError("a Following can be entered only once; call following() again")
-        self._check_leader()
+        _check_leader(self._leader)
         self._was_entered = True
         self._action = FleetAction(self._context, "following", self._followers, self._fly_follower, moves_members=True)
         self._tasks.start(self._follow, "aerokit following")
@@ -236,6 +241,7 @@ class Following:
     async def __aexit__(self, exc_type: object, exc: object, traceback: object) -> None:
         self._stopped.set()
         await self._tasks.aclose()
+        self._context.actions.pop(self._action, None)  # The task may have been cancelled before it began.
         if exc is None and not self._has_raised:
             self.raise_if_stopped()
 
@@ -246,7 +252,6 @@ class Following:
         self._stop_if_no_followers()
 
     async def _fly_follower(self, member: Member) -> None:
-        """Fly a member towards its place until following stops."""
         try:
             async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
                 while not self._stop_if_leader_lost():
@@ -259,26 +264,22 @@ class Following:
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
-        """Stop following if no member follows any more, and give the failures as the reason."""
-        if not self._action.active and self._action.program_error is None:
+        if not self._action.active_names and self._action.program_error is None:
             result = self._action.result_so_far()
             failed = {name: str(error) for name, error in result.failed.items()}
             reason = "; ".join(f"{name}: {error}" for name, error in failed.items())
-            self._stop(reason or "no follower is left", self._action.orders, {**result.skipped, **failed})
+            self._stop(reason or "no follower is left", self._action.policy_orders, {**result.skipped, **failed})
 
     def _stop_if_leader_lost(self) -> bool:
-        """Stop following if the leader is unavailable, or its position or a needed heading is unknown or outdated.
-
-        Return True if following has stopped, now or before.
-        """
+        """Stop following if the leader is lost. Return True if following has stopped."""
         if not self._stopped.is_set():
             try:
-                self._check_leader()
+                _check_leader(self._leader)
                 position_of(self._leader, FOLLOWING_MAX_AGE_S)
                 _heading_for(self._formation, self._leader, FOLLOWING_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
                 # The active members hold, because `_tasks.cancel()` below ends their streams.
-                holding = self._action.active
+                holding = self._action.active_names
                 skipped = {
                     member.name: member.status if member.reason else "it does not follow"
                     for member in self._followers
@@ -289,7 +290,6 @@ class Following:
         return self._stopped.is_set()
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
-        """Return the velocity of the leader, plus a correction towards the member's place."""
         velocity = self._leader.vehicle.velocity.latest
         leader_velocity = (0.0, 0.0, 0.0)  # while the velocity is unknown
         if velocity is not None:
@@ -300,10 +300,7 @@ class Following:
         return VelocitySetpoint(north, east, -up)
 
     def _vector_to_place(self, member: Member) -> tuple[float, float, float]:
-        """Return the vector from a member to its place, in metres north, east and up.
-
-        The positions of the member and the leader are extrapolated to the present by their velocities.
-        """
+        """Return the present vector from a member to its place, in metres north, east and up."""
         leader, vehicle = self._leader.vehicle, member.vehicle
         leader_position = position_of(self._leader, FOLLOWING_MAX_AGE_S)
         position = position_of(member, FOLLOWING_MAX_AGE_S)
@@ -335,13 +332,7 @@ class Following:
                 up -= signed_age * velocity.down_m_s
         return north, east, up
 
-    def _check_leader(self) -> None:
-        self._leader.refresh()
-        if not self._leader.is_available:
-            raise OperationRejected(f"the leader {self._leader.name} is {self._leader.status}")
-
     def _stop(self, reason: str, orders: Mapping[str, str], skipped: Mapping[str, str]) -> None:
-        """Record that following has stopped early, and publish it. Later calls do nothing."""
         if self._stopped.is_set():
             return
         self._reason = reason
@@ -352,9 +343,8 @@ class Following:
         )
 
     def _on_error(self, error: Exception) -> None:
-        """Stop following after an error in the program. If the policy gave no orders, all available followers hold."""
         hold_orders = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
-        self._stop(str(error) or type(error).__name__, self._action.orders or hold_orders, {})
+        self._stop(str(error) or type(error).__name__, self._action.policy_orders or hold_orders, {})
 
 
 @checks_arguments
@@ -422,7 +412,6 @@ class Formations(Travel):
         return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
-        """Check a formation and its leader. Return the member that leads, and the members that follow."""
         arguments = {leader: "leader", **dict.fromkeys(formation.offsets, "formation")}
         for name, argument in arguments.items():
             if name not in self.members:
@@ -438,7 +427,5 @@ class Formations(Travel):
                 f"formation: two places are {closest_m:.1f} m apart; the minimum of this fleet is {min_m:g} m"
             )
         member = self.members[leader]
-        member.refresh()
-        if not member.is_available:
-            raise OperationRejected(f"the leader {leader} is {member.status}")
+        _check_leader(member)
         return member, [self.members[name] for name in formation.offsets]

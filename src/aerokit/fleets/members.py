@@ -159,11 +159,7 @@ class Member:
         return bool(self._detachments)
 
     def _takeover_reason(self) -> str:
-        """Return why the member counts as taken over; an empty string if it does not.
-
-        A failsafe that was active at `reclaim` is ignored unless it gets worse. Once this method was called without a
-        failsafe, the next failsafe counts again.
-        """
+        """Return why the member counts as taken over; an empty string if it does not."""
         vehicle = self.vehicle
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
@@ -171,6 +167,7 @@ class Member:
         if vehicle.is_confirmed_disarmed:  # a disarmed vehicle does not fly, so there is no control to take over
             self._control_when_reclaimed = None  # If another party arms it next, this is a takeover.
             return ""
+        # A failsafe that was active at `reclaim` is ignored until it gets worse.
         if state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
         uses_missions = "mission" in vars(vehicle)  # vehicle.mission is created at its first use
@@ -184,7 +181,6 @@ class Member:
         return "this program did not arm it" if vehicle.is_armed and has_no_order else ""
 
     def _current_control(self) -> tuple[object, object]:
-        """Return the vehicle's newest order and its mode."""
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _refresh_soon(self, *_: object) -> None:
@@ -213,7 +209,6 @@ class Member:
         self._on_unavailable(self)
 
     def _set_active_again(self) -> None:
-        """End the state LOST. The member is then active, or taken over if another program or a pilot controls it."""
         if self.state is not MemberState.LOST or not self._is_monitored:
             return
         if reason := self._takeover_reason():
@@ -231,5 +226,4 @@ class Member:
         self.absences += not self.is_available
 
     def _event_fields(self) -> tuple[float, int, str]:
-        """Return the first fields of each FleetEvent: the time, and the member's system id and name."""
         return self.vehicle.connection.now(), self.vehicle.system_id, self.name

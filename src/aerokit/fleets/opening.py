@@ -144,7 +144,6 @@ async def fleet(
 
 
 def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Source]:
-    """Return all sources by name. Sources outside of mappings are named by their number."""
     sources_by_name: dict[str, Source] = {}
     for number, source in enumerate(sources, 1):
         entries = source if isinstance(source, Mapping) else {str(number): source}
@@ -162,10 +161,7 @@ def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[s
 def _members_of_vehicles(
     sources_by_name: Mapping[str, Source], given_names: set[str], networks: dict[str, Connection]
 ) -> list[Member]:
-    """Return a member for each vehicle object among the sources, and add the vehicles' connections to the networks.
-
-    A source's name becomes the member's name if it is in ``given_names``: the program has chosen it.
-    """
+    """Return a member for each vehicle object, and add the vehicles' connections to ``networks``."""
     members: list[Member] = []
     for name, source in sources_by_name.items():
         if isinstance(source, Vehicle):
@@ -174,6 +170,7 @@ def _members_of_vehicles(
             if network is None:
                 network = name
                 networks[name] = source.connection
+            # The program has chosen the names in `given_names`.
             member_name = name if name in given_names else f"{network}/{source.system_id}"
             members.append(Member(member_name, network, source))
     return members
@@ -182,7 +179,7 @@ def _members_of_vehicles(
 def _requested_ids(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None, networks: list[str]
 ) -> dict[str, list[int] | None]:
-    """Return the requested system ids of each network. None instead of a list means all that are found."""
+    """Return the requested system ids of each network; None means all that are found."""
     ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - `fromkeys` has a narrower type
     if isinstance(system_ids, Mapping):
         for name, network_ids in system_ids.items():
@@ -210,7 +207,7 @@ def _check_names(members: list[Member]) -> None:
 
 
 def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
-    """Set ``attribute`` (``group`` or ``role``) to each name, for the members that match the patterns of the name."""
+    """Set ``attribute`` (``group`` or ``role``) of the members that match the patterns of each name."""
     for name, one_or_more in patterns_by_name.items():
         patterns = [one_or_more] if isinstance(one_or_more, str) else one_or_more
         for member_name in context.matching(*patterns):
@@ -269,7 +266,6 @@ async def find_systems(
         return all(found[name] for name in searched)
 
     def describe_progress() -> str:
-        """Return which vehicles were found so far, for the warning and the time-out error."""
         names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
         listed = ", ".join(names)
         if count is not None:
@@ -315,7 +311,10 @@ async def find_systems(
 
 @contextmanager
 def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[None]:
-    """Log one warning if the ``with`` block takes longer than five seconds; ``describe`` returns what is missing."""
+    """Log one warning if the ``with`` block takes longer than five seconds.
+
+    ``describe`` returns what is missing.
+    """
 
     def warn() -> None:
         logger.warning("fleet: %s after %g s; waiting up to %g s in total", describe(), WAIT_WARNING_S, timeout)
@@ -346,9 +345,9 @@ class MemberConnections:
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
-        """Connect to all systems, given as tuples of network, connection and system id.
+        """Connect to systems, given as tuples of network, connection and system id.
 
-        Return the network and the vehicle of each system, in the same order.
+        Returns the network and the vehicle of each system, in the same order.
         """
         for index, (network, connection, system_id) in enumerate(systems):
             self._running_task_count += 1
@@ -373,7 +372,6 @@ class MemberConnections:
         error: BaseException | None = None,
         traceback: TracebackType | None = None,
     ) -> None:
-        """Close all vehicles, and wait until they are closed. The arguments are the exception of the fleet's block."""
         self._has_block_failed = error is not None
         self._close.set()
         # If a task is still connecting, opening has failed, and cancelling all tasks is enough.
@@ -386,7 +384,6 @@ class MemberConnections:
         await self._all_closed.wait()
 
     async def _run(self, index: int, network: str, connection: Connection, system_id: int) -> None:
-        """Connect one vehicle, and keep it connected until the fleet closes."""
         try:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
                 self._connected[index] = (network, vehicle)

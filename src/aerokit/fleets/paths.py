@@ -151,14 +151,13 @@ def horizontal_distance(line: tuple[LocalPoint, LocalPoint], other: tuple[LocalP
 
 
 def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
-    """Return a leg between two points, with altitudes and times of 0."""
     north_m, east_m, _ = start
     end_north_m, end_east_m, _ = end
     return PathPoint(0.0, north_m, east_m, up_m=0.0), PathPoint(0.0, end_north_m, end_east_m, up_m=0.0)
 
 
 def _lower_bound(leg: Leg, other: Leg) -> float:
-    """Return a lower bound of the distance of two legs: the distance of their midpoints minus half of each length."""
+    """Return a distance in metres that two legs have at least."""
     return math.dist(_midpoint(leg), _midpoint(other)) - _length(leg) / 2 - _length(other) / 2
 
 
@@ -173,13 +172,7 @@ def _midpoint(leg: Leg) -> tuple[float, ...]:
 
 
 def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
-    """Return the closest approach of two legs, for pairs of times that differ by at most ``slack_s``.
-
-    Return None if no pair of times on the two legs is that close.
-
-    With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
-    cuts a strip out of the unit square of (s, t). The minimum is inside the resulting polygon or on its border.
-    """
+    """Return the closest approach of two legs at times that differ by at most ``slack_s``; None if there is none."""
     start, end = leg
     other_start, other_end = other
     vector = _difference(end.place, start.place)
@@ -194,8 +187,9 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     def difference(s: float, t: float) -> list[float]:
         return [start_difference[i] + s * vector[i] - t * other_vector[i] for i in range(3)]
 
-    # If the closest points of the whole legs satisfy the time condition, they are the result. Otherwise the minimum is
-    # on the border of the polygon.
+    # With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
+    # cuts a strip out of the unit square of (s, t). If the closest points of the whole legs satisfy this condition,
+    # they are the result. Otherwise the minimum is on the border of the resulting polygon.
     inside = _closest_inside(start_difference, vector, other_vector)
     if inside is not None and abs(time_difference(*inside)) <= slack_s:
         corners = [inside]  # a polygon that is a single point
@@ -217,10 +211,9 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
 def _closest_inside(
     start_difference: Sequence[float], vector: Sequence[float], other_vector: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return the s and t (see `_closest`) at which the straight lines through two legs are closest to each other.
+    """Return the s and t (see `_closest`) at which the lines through two legs are closest to each other.
 
-    At these values, both derivatives of the squared distance are 0. Return None if a value is not within 0 to 1, which
-    is beyond the leg, or if the lines are parallel.
+    Returns None if that place is beyond the end of a leg, or if the lines are parallel.
     """
     # Dot products of a (`vector`), b (`other_vector`) and d (`start_difference`).
     aa, bb = _dot(vector, vector), _dot(other_vector, other_vector)
@@ -229,6 +222,7 @@ def _closest_inside(
     if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):  # the lines are parallel, or a leg has no length
         return None
     da, db = _dot(start_difference, vector), _dot(start_difference, other_vector)
+    # At these values, both derivatives of the squared distance are 0.
     s = (ab * db - bb * da) / determinant
     t = (aa * db - ab * da) / determinant
     return (s, t) if 0 <= s <= 1 and 0 <= t <= 1 else None
@@ -255,9 +249,9 @@ def _closest_on_edge(
     difference: Sequence[float],
     other_difference: Sequence[float],
 ) -> tuple[float, float]:
-    """Return the s and t (see `_closest`) on an edge of the polygon for which the two places are closest to each other.
+    """Return the s and t (see `_closest`) of the closest approach on one edge of the polygon.
 
-    ``difference`` and ``other_difference`` are the vectors between the two places at the two ends of the edge.
+    The differences are the vectors between the two places at the two ends of the edge.
     """
     step = _difference(other_difference, difference)
     squared_length = _dot(step, step)

@@ -134,7 +134,7 @@ def separate_by_altitude(
 def _layer_heights(
     routes: Sequence[Route], stationary: Mapping[str, LocalPoint], lowest_m: float, min_distance_m: float
 ) -> dict[str, float]:
-    """Return the height of each route: the lowest layer that no crossing route and no stationary vehicle blocks."""
+    """Return the altitude of each route: that of the lowest layer that nothing blocks."""
     heights: dict[str, float] = {}
     for route in routes:
         earlier_routes = [earlier for earlier in routes if earlier.name in heights]
@@ -200,7 +200,6 @@ def separate_by_time(
 def _conflicts(
     routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float
 ) -> tuple[Conflict, ...]:
-    """Return the conflicts of routes with each other and with stationary vehicles, regardless of time."""
     _check_distance(min_distance_m)
     # Times are ignored here, so the paths can have any speed.
     paths = [Path.straight(route.name, route.start, route.target, speed_m_s=1.0) for route in routes]
@@ -215,7 +214,6 @@ def _conflicts(
 
 
 def resting_paths(stationary: Mapping[str, LocalPoint]) -> list[Path]:
-    """Return a path of one point for each stationary vehicle."""
     return [Path(name, (PathPoint(0.0, *point),)) for name, point in stationary.items()]
 
 
@@ -228,10 +226,10 @@ def _delays(
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
-    """Find delays (s) by which no route conflicts with a resting path, or with a route before it in the sequence.
+    """Find the delays in seconds that prevent all conflicts, route by route in this sequence.
 
-    Return (delays by name, None, ""). If a route needs more than the maximum delay, return (delays of the routes before
-    it, this route, name of the vehicle that blocks it).
+    If a route needs more than the maximum, return the delays so far, this route, and the name of the vehicle that
+    blocks it.
     """
     delayed_paths: list[Path] = []
     delays: dict[str, float] = {}
@@ -286,7 +284,6 @@ def _is_layer_blocked(
 
 
 def _find_blocker(path: Path, others: Sequence[Path], min_distance_m: float, slack_s: float) -> str | None:
-    """Return the name of the first of the other paths that the path comes too close to; None if there is none."""
     for other in others:
         approach = min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m)
         if approach.distance_m < min_distance_m:
@@ -295,7 +292,6 @@ def _find_blocker(path: Path, others: Sequence[Path], min_distance_m: float, sla
 
 
 def describe_pairs(conflicts: Sequence[Conflict]) -> str:
-    """Return the names and distances of the first conflicts, and the number of the others, for texts."""
     texts = [f"{conflict.name} and {conflict.other} ({conflict.distance_m:.1f} m)" for conflict in conflicts[:3]]
     more = len(conflicts) - len(texts)
     more_text = f" and {more} more pairs" if more else ""

@@ -212,13 +212,12 @@ def max_relative_error(
 
 
 def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
-    """Return the vector to a point from another point."""
     north, east, up = (a - b for a, b in zip(point, other, strict=True))
     return north, east, up
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
-    """Return the position at a time, interpolated between samples; None outside of their times."""
+    """Return the position at a time between two samples; None if there are no such samples."""
     for (start_s, start), (end_s, end) in pairwise(samples):
         if start_s <= at_s <= end_s:
             fraction = 0.0 if end_s == start_s else (at_s - start_s) / (end_s - start_s)
@@ -267,8 +266,7 @@ class TrackRecorder:
     def extrapolated_position(self) -> LocalPoint:
         """Return the latest position, extrapolated to now by its velocity.
 
-        Raises:
-            StaleValueError: no position was received in the last two seconds.
+        Raises StaleValueError if no position was received in the last two seconds.
         """
         if self._latest is not None:
             measured_at, (north, east, up), (north_m_s, east_m_s, up_m_s) = self._latest
@@ -278,7 +276,6 @@ class TrackRecorder:
         raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
 
     def _on_message(self, message: GlobalPositionInt) -> None:
-        """Store the latest position, and add it to the samples unless it was measured before the start of the show."""
         frame = message.received_frame
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
@@ -300,7 +297,7 @@ class TrackRecorder:
 
 
 def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -> tuple[float, float]:
-    """Return the metres per degree of latitude and per degree of longitude, for places within some hundred metres."""
+    """Return the metres per degree of latitude and of longitude near a place."""
     step = 1e-3
     north_m, _, _ = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)
     _, east_m, _ = origin.to_local(Position(latitude, longitude + step), 0.0)
@@ -429,7 +426,6 @@ class Shows(Travel):
         }
 
     def _check_show(self, show: Show, origin: LocalOrigin, origin_amsl_m: float) -> None:
-        """Raise OperationRejected if a member is unavailable or its track is too close to another track or member."""
         for name in show.tracks:
             self._check_available(self.members[name], "fly_show", "nothing was sent")
         min_m = self._context.min_distance_m
@@ -465,16 +461,11 @@ async def _fly_track(
     lead_s: float,
     max_late_s: float,
 ) -> None:
-    """Fly a member along its path, from the current time until the end of the path.
-
-    Raises:
-        OperationRejected: the member would join its path more than ``max_late_s`` late. It is not flown there, because
-            the way from its position to the path was not compared with the other paths.
-    """
     vehicle, period_s = member.vehicle, 1 / rate_hz
     with vehicle._session.streaming("position"):
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
             late_s = vehicle.connection.now() - begin_at - path.begins_at_s
+            # The way from the member's position to its path was not compared with the other paths.
             if late_s > max_late_s:
                 raise OperationRejected(f"show: {member.name} would join its track {late_s:.1f} s late, so it holds")
             # From here on, the stream itself stops if the event loop is blocked.
@@ -488,10 +479,7 @@ async def _fly_track(
 
 
 def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> VelocitySetpoint:
-    """Return the velocity of the path at ``at_s + lead_s``, corrected for the vehicle's deviation from the path.
-
-    The deviation is the vector from ``position`` to the point of the path at ``at_s``.
-    """
+    """Return the velocity of the path at ``at_s + lead_s``, corrected for the deviation at ``at_s``."""
     planned, _ = state_at(path, at_s)
     _, velocity = state_at(path, at_s + lead_s)
     speed = math.hypot(*velocity)

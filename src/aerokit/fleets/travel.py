@@ -162,8 +162,7 @@ class Travel(SelectionBase):
     ) -> FleetResult:
         """Fly members to their targets, directly or with the planned separation.
 
-        ``names`` are the members of the result, which lists those without a target as skipped. Default: the members
-        with a target.
+        ``names`` lists the members of the result. By default, these are the members with a target.
         """
         if separation is not None:
             self._check_plan(action, targets, separation)
@@ -200,7 +199,7 @@ class Travel(SelectionBase):
         return result
 
     def _check_plan(self, action: str, targets: Mapping[str, Position], plan: Deconfliction) -> None:
-        """Raise OperationRejected unless the plan was made for these targets and the members' present positions."""
+        """Raise OperationRejected if the plan was made for other targets or positions."""
         routes, stationary = self._routes(targets)
         present = {route.name: route for route in routes}
         planned = {route.name: route for route in plan.routes}
@@ -224,7 +223,7 @@ class Travel(SelectionBase):
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]
     ) -> dict[str, Position]:
-        """Return the targets by member name. If ``targets`` is a function, it is called for available members only."""
+        """Return the targets by member name. A function is called for available members only."""
         for member in self:
             member.refresh()
         if callable(targets):
@@ -237,7 +236,7 @@ class Travel(SelectionBase):
         return {name: travel_target(target) for name, target in targets.items()}
 
     def _routes(self, targets: Mapping[str, Position]) -> tuple[list[Route], dict[str, LocalPoint]]:
-        """Return the routes of the moving members, and the known positions of all other members of the fleet."""
+        """Return the routes of the available members, and the known positions of all other members of the fleet."""
         members = self._context.members
         moving = [members[name] for name in targets if members[name].is_available]
         if not moving:
@@ -246,7 +245,7 @@ class Travel(SelectionBase):
         routes = [
             Route(
                 member.name,
-                origin.of_member(member),
+                origin.local_position_of(member),
                 origin.to_local(targets[member.name], altitude_amsl(member, targets[member.name])),
             )
             for member in moving
@@ -265,8 +264,6 @@ class Travel(SelectionBase):
         stagger_s: float | None = None,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
-        """Fly members straight to their targets. If ``corridors`` has a delay for a member, that member waits first."""
-
         async def fly(member: Member) -> None:
             await member.vehicle.go_to(
                 targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
@@ -285,7 +282,6 @@ class Travel(SelectionBase):
         max_distance_m: float,
         stagger_s: float | None,
     ) -> FleetResult:
-        """Fly up to the layers, across, and down. A leg begins when all members have finished the previous leg."""
         starts = {name: position_of(self._context.members[name]) for name in heights_m}
         climb = {name: _at_altitude(starts[name], height) for name, height in heights_m.items()}
         crossing = {name: _at_altitude(targets[name], height) for name, height in heights_m.items()}
@@ -406,11 +402,7 @@ class Missions(SelectionBase):
             OperationRejected: no mission was uploaded, the last upload failed or was for other members only, or a
                 member is unavailable or not armed. Nothing was sent.
         """
-        names = tuple(name for name in self._context.missions if name in self.members)
-        if not names:
-            raise OperationRejected(
-                "start_missions: the last upload failed, or had no mission for these members; call upload() first"
-            )
+        names = self._names_with_mission("start_missions")
         members = self._require_available(dict.fromkeys(names))
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:
@@ -431,11 +423,7 @@ class Missions(SelectionBase):
         Raises:
             OperationRejected: no mission was uploaded, or the last upload failed or was for other members only.
         """
-        names = tuple(name for name in self._context.missions if name in self.members)
-        if not names:
-            raise OperationRejected(
-                "wait_missions_finished: the last upload failed, or had no mission for these members"
-            )
+        names = self._names_with_mission("wait_missions_finished")
         return await self._run(
             "mission.wait_finished", lambda member: member.vehicle.mission.wait_finished(timeout=timeout), names=names
         )
@@ -485,8 +473,15 @@ class Missions(SelectionBase):
         )
         return deconfliction
 
+    def _names_with_mission(self, action: str) -> tuple[str, ...]:
+        names = tuple(name for name in self._context.missions if name in self.members)
+        if not names:
+            raise OperationRejected(
+                f"{action}: the last upload failed, or had no mission for these members; call upload() first"
+            )
+        return names
+
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
-        """Return the members that get missions, by name; raise if a name is unknown or a member is unavailable."""
         members: dict[str, Member] = {}
         for name in missions:
             if name not in self.members:
@@ -502,7 +497,7 @@ class Missions(SelectionBase):
 def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path:
     """Return the path of a mission from the member's present position, with time 0 for all points."""
     here = position_of(member)
-    points = [PathPoint(0.0, *origin.of_member(member))]
+    points = [PathPoint(0.0, *origin.local_position_of(member))]
     for item in mission:
         if item.command >= MavCmd.NAV_LAST or item.command == MavCmd.NAV_ROI:  # the vehicle does not fly there
             continue

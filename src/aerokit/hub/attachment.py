@@ -97,7 +97,6 @@ class Attachment:
             await self.link.wait_closed()
 
     def statistics(self) -> EndpointStatistics:
-        """Return the counters of all peers together, including forgotten ones."""
         router, ports = self._switch.router, tuple(self._ports.values())
         totals = self._totals_of_forgotten_peers
         for framer in self._peers:
@@ -128,11 +127,8 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Process received bytes, or collect them until the burst ends.
-
-        Datagrams that a peer sends in one burst are joined and processed together. One that does not begin with a frame
-        is not joined, because the joined data is forwarded unchanged only if it consists of whole frames.
-        """
+        # Datagrams of one burst of a peer are joined and processed together. A datagram that does not begin with a
+        # frame is not joined, because the joined data is forwarded unchanged only if it consists of whole frames.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
@@ -155,7 +151,6 @@ class Attachment:
                 self._receive(data, self._burst_peer)
 
     def _receive(self, data: bytes, peer: Peer) -> None:
-        """Check the frames in received bytes, and forward them. Errors are reported as an event."""
         try:
             now = self._now()
             # Frames of our own program come without a socket, and therefore have not waited.
@@ -210,14 +205,12 @@ class Attachment:
     # ------------------------------------------------------------------------------------ ports
 
     def _on_up(self) -> None:
-        """Record that the link is open, for the first time or again. Each loss of the link removes all ports."""
         self.is_open, self._reports_bursts = True, self.link.reports_bursts
         self._is_single = self.link.has_peer(None)
         if self._is_single and None not in self._ports:
             self._add_port(None)
 
     def _on_down(self) -> None:
-        """Record that the link is lost or closed, and remove its ports."""
         if self._burst:  # The link was lost before it reported the end of the burst.
             self.burst_ended()
         self.is_open = False
@@ -225,7 +218,6 @@ class Attachment:
             self._forget(peer)
 
     def _add_port(self, peer: Peer) -> Port:
-        """Add a port for a peer that has sent its first valid frame, or for the single remote end of the link."""
         port = self._ports[peer] = Port(
             self.link,
             peer,
@@ -255,7 +247,6 @@ class Attachment:
         self._peers.forget(peer)
 
     def _forget_port(self, peer: Peer) -> None:
-        """Remove the port of a peer. The counters of its framer stay in the endpoint's totals."""
         framer = self._peers.framers.get(peer)
         if framer is not None:
             self._totals_of_forgotten_peers = self._totals_of_forgotten_peers.plus(framer)
@@ -301,12 +292,11 @@ def _client_name(peer: Peer) -> str:
 
 
 def filters_of(endpoint: Endpoint, dialect: Dialect) -> Filters:
-    """Make the filters of an endpoint. Raises InvalidArgument if a pattern matches no message of the dialect."""
     return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
 
 
 def _min_queue_above_bytes(address: str) -> int:
-    """Return the smallest limit of the links in an address, which may name several links."""
+    # An address may name several links.
     kinds = (part.split(":")[0] for part in address.removeprefix("shared:").split(" + "))
     return min(QUEUE_ABOVE_BYTES.get(kind, DEFAULT_QUEUE_ABOVE_BYTES) for kind in kinds)
 

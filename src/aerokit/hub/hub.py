@@ -201,7 +201,7 @@ class Hub:
     # ------------------------------------------------------------------------------------ internal
 
     async def _add(self, endpoint: Endpoint) -> Attachment:
-        """Open an endpoint and attach it. If that fails, raise LinkError or, with ``retry_open``, retry it later."""
+        """Open an endpoint and attach it. With ``retry_open``, a failure is retried later."""
         assert self._switch is not None
         assert self._background is not None
         clock = asyncio.get_running_loop().time
@@ -225,11 +225,9 @@ class Hub:
         return attachment
 
     def _has(self, attachment: Attachment) -> bool:
-        """Return False if the endpoint was removed, or if the hub was closed."""
         return self._attachments.get(attachment.name) is attachment
 
     async def _retry_opening(self, attachment: Attachment) -> None:
-        """Try to open an endpoint until it is open or removed, with increasing delays."""
         backoff = Backoff()
         while self._has(attachment):
             await anyio.sleep(backoff.next_delay())
@@ -245,7 +243,6 @@ class Hub:
                 return
 
     async def _close(self) -> None:
-        """Close all endpoints and the recording, and wait until they are closed."""
         self._is_closed = True
         attachments, self._attachments = list(self._attachments.values()), {}
         for attachment in attachments:
@@ -272,7 +269,6 @@ class Hub:
         return self._switch
 
     def _report(self, attachment: Attachment, kind: HubEventKind, text: str) -> None:
-        """Log an event of an endpoint, and pass it to the listeners."""
         logger.log(logging.INFO if kind in _INFO_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text)
         event = HubEvent(asyncio.get_running_loop().time(), attachment.name, kind, text)
         for listener in tuple(self._listeners):
@@ -282,7 +278,6 @@ class Hub:
                 logger.exception("listener %r raised an exception; the others are still called", listener)
 
     def _on_change(self, kind: HubEventKind, source: int, port: Port, other_port: Port | None) -> None:
-        """Report an event of the router about the sender ``source`` (system id + 256 · component id)."""
         if other_port is not None and other_port.endpoint == port.endpoint and kind == "route_changed":
             return  # The endpoint's IdentityGuard reports a change between two peers of the same endpoint.
         ids = f"{source & 0xFF}/{source >> 8}"
@@ -312,7 +307,6 @@ def _period(port: Port, message_id: int) -> float | None:
 
 
 async def _wait_until_closed(attachments: list[Attachment]) -> None:
-    """Wait until the links of these attachments are closed, but at most `CLOSE_TIMEOUT_S` seconds."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
         for attachment in attachments:
             await attachment.wait_closed()

@@ -78,7 +78,6 @@ class Filters:
         return self._periods[message_id]
 
     def _period(self, name: str) -> float | None:
-        """Compute the result of :meth:`period` for a message of the dialect, by name."""
         if self._only and not any(fnmatchcase(name, pattern) for pattern in self._only):
             return None
         if any(fnmatchcase(name, pattern) for pattern in self._block):
@@ -91,7 +90,6 @@ class Filters:
         return 0.0 if rate_hz is None else 1 / rate_hz
 
     def _check(self, field: str, pattern: str) -> None:
-        """Raise InvalidArgument if a pattern matches no message."""
         names = [message_type.NAME for message_type in self._dialect]
         if not any(fnmatchcase(name, pattern) for name in names):
             raise InvalidArgument(
@@ -147,7 +145,6 @@ _ORDERS = (
 
 @cache
 def kind_of(name: str, *, has_target: bool) -> MessageKind:
-    """Return the kind of a message by its name. A frame with a target (``has_target``) is not telemetry."""
     if name not in _NOT_ORDERS and any(fnmatchcase(name, pattern) for pattern in _ORDERS):
         return MessageKind.ORDER
     if name in _TELEMETRY and not has_target:
@@ -216,14 +213,13 @@ class TargetFields:
                 self.offsets.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component_offset)))
 
     def look_up(self, message_id: int) -> FieldOffsets | None:
-        """Return the offsets of a message's target ids; None if it has none, or is not in the dialect."""
+        """Return the offsets of a message's target ids; None if it has no target."""
         if message_id not in self._dialect.rows:
             return None  # An unknown id is not stored, because noise may contain millions of ids.
         offsets = self.offsets[message_id] = _field_offsets(self._dialect[message_id])
         return offsets
 
     def is_unknown(self, message_id: int) -> bool:
-        """Return True if the message is not in the dialect, so that its checksum was not checked."""
         return message_id not in self._dialect.rows
 
     def is_command(self, message_id: int) -> bool:
@@ -247,7 +243,6 @@ class TargetFields:
 
 
 def _field_offsets(message_type: type[Message]) -> FieldOffsets | None:
-    """Return the offsets of the target's ids in `Frame.body`; None if the message has no target."""
     names = {field.name for field in message_type.FIELDS}
     system = _SYSTEM_FIELDS.get(message_type.NAME, "target_system")
     if system not in names:

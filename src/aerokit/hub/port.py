@@ -55,7 +55,10 @@ class FrameQueue:
         return len(self._frames)
 
     def put(self, frame: QueuedFrame, key: int) -> list[tuple[str, QueuedFrame]]:
-        """Add a frame; ``key`` identifies its sender and message. Return the frames dropped for it, with the reason."""
+        """Add a frame. Return the frames that were dropped for it, with the reasons.
+
+        ``key`` identifies the sender and the message.
+        """
         dropped: list[tuple[str, QueuedFrame]] = []
         if frame.kind is MessageKind.TELEMETRY:
             replaced = self._frames.get(key)
@@ -78,7 +81,7 @@ class FrameQueue:
         return dropped
 
     def expire(self, now: float) -> list[tuple[str, QueuedFrame]]:
-        """Remove commands that have waited too long, and return them with the reason."""
+        """Remove and return the commands that have waited too long."""
         if not self._order_count:
             return []
         late = [
@@ -89,7 +92,7 @@ class FrameQueue:
         return [("late", self._remove(key)) for key in late]
 
     def pop(self) -> bytes | None:
-        """Remove and return the first frame, or None if the queue is empty. Call :meth:`expire` before."""
+        """Remove and return the first frame. Call :meth:`expire` before."""
         if not self._frames:
             return None
         first_key = next(iter(self._frames))
@@ -110,7 +113,6 @@ class FrameQueue:
         return frame
 
     def _count(self, frame: QueuedFrame, change: int) -> None:
-        """Update the counts for an added frame (``change`` is 1) or a removed frame (-1)."""
         self._bytes += change * len(frame.raw)
         if frame.kind is MessageKind.ORDER:
             self._order_count += change
@@ -119,7 +121,7 @@ class FrameQueue:
 
 
 def _to_mavlink2(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
-    """Return the frame as MAVLink 2 with these incompatibility flags and a new checksum.
+    """Return the frame as MAVLink 2 with these incompatibility flags.
 
     With the flag SIGNED, the caller must append the signature.
     """
@@ -144,7 +146,7 @@ class SigningGateway:
         self._extras, self._refused = crc_extras, refused
 
     def verify(self, frame: Frame, unix_time: float) -> Frame | None:
-        """Verify a received frame. Return the frame without its signature; None if the frame is refused."""
+        """Return a received frame without its signature; None if the frame is refused."""
         try:
             refusal = self.signing.check(frame, unix_time)
         except Exception as error:  # `check` calls the program's function `allow_unsigned`.
@@ -162,7 +164,7 @@ class SigningGateway:
         return Frame.parse(_to_mavlink2(frame, extra, flags=0), frame.received_at)
 
     def sign(self, raw: bytes, unix_time: float) -> bytes | None:
-        """Return the frame ``raw`` with a signature; None if the dialect does not have the message."""
+        """Return a frame with a signature; None if the dialect does not have the message."""
         frame = Frame.parse(raw)
         extra = self._extras.get(frame.message_id)
         if extra is None:
@@ -251,14 +253,12 @@ class Port:
 
     @property
     def joins_frames(self) -> bool:
-        """True if several frames may be written in one piece."""
         return self.gateway is None and not self.writes_single_frames
 
     def must_queue(self) -> bool:
         return self._may_queue and (bool(self._queue) or self._is_full())
 
     def enqueue(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        """Queue a frame, because the link does not drain. A full queue drops frames."""
         message_type = self._dialect.get(plan.message_id)
         kind = MessageKind.TRANSFER  # An unknown message may be part of a transfer, so it is never replaced.
         if message_type is not None:
@@ -267,7 +267,10 @@ class Port:
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def is_due(self, key: int, period_s: float, now: float) -> bool:
-        """Return True if the rate limit allows a frame of this sender and message (``key``) now, else count a drop."""
+        """Return True if the rate limit allows a frame now. Otherwise count it as dropped.
+
+        ``key`` identifies the sender and the message.
+        """
         due = self._due.get(key)
         if due is not None and now < due:
             self.counters.dropped["rate_limited"] += 1
@@ -283,7 +286,6 @@ class Port:
         return True
 
     def flush(self, unix_time: float) -> None:
-        """Write the batch, signed if the endpoint signs."""
         batch, self.batch = self.batch, []
         if self.gateway is not None:
             batch = self._signed(batch, unix_time)
@@ -296,7 +298,6 @@ class Port:
             write(piece, peer)
 
     def drain(self, now: float, unix_time: float) -> None:
-        """Drop queued commands that have waited too long, then write queued frames while the link accepts data."""
         self._drop(self._queue.expire(now))
         while self._queue and not self._is_full():
             raw = self._queue.pop()
@@ -305,11 +306,9 @@ class Port:
             self.flush(unix_time)
 
     def drop_orders(self) -> None:
-        """Drop all queued commands."""
         self._drop(self._queue.expire(math.inf))
 
     def drop_late(self, frame: Frame, target: tuple[int, int], arrived_at: float) -> None:
-        """Drop a command that arrived at this port at this time, and was read too late."""
         self._drop([("late", QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, arrived_at))])
 
     def close(self) -> None:
@@ -334,7 +333,7 @@ class Port:
 
 
 def joined(batch: list[bytes]) -> list[bytes]:
-    """Join small pieces to pieces of at most `MAX_JOINED_BYTES`. A piece that is larger stays as it is."""
+    """Join small pieces to pieces of at most `MAX_JOINED_BYTES`."""
     whole = b"".join(batch)
     if len(whole) <= MAX_JOINED_BYTES:
         return [whole] if whole else []

@@ -165,7 +165,6 @@ class Router(Generic[PortT]):
         return (node.port for node in self._nodes.values())
 
     def exclude_pause(self, now: float, paused_s: float) -> None:
-        """Do not count the last ``paused_s`` seconds as silence of any sender."""
         for sender in self._senders.values():
             sender.exclude_pause(now, paused_s)
 
@@ -238,6 +237,7 @@ class Router(Generic[PortT]):
         if sender.port_number == number:
             sender.received_at = now
         else:
+            # An autopilot has priority over other senders with its ids, so it moves to this port at once.
             must_move = not (message_id or sender.is_autopilot) and is_autopilot(body)
             self._record_at_other_port(sender, node, now, must_move)
         if not message_id:
@@ -272,7 +272,6 @@ class Router(Generic[PortT]):
         return sender
 
     def _make_room(self, now: float) -> bool:
-        """Forget a sender without heartbeats, or if there is none, all silent senders. Return True if there is room."""
         if self._unproven:
             source = next(iter(self._unproven))
             del self._unproven[source], self._senders[source]
@@ -284,10 +283,6 @@ class Router(Generic[PortT]):
         return len(self._senders) < MAX_ROUTES
 
     def _record_at_other_port(self, sender: Sender, node: RouterPort[PortT], now: float, must_move: bool) -> None:
-        """Record a frame that arrived at another port than the sender's. A silent sender moves to this port.
-
-        With ``must_move``, it moves at once, because an autopilot has priority over other senders with its ids.
-        """
         former_number = sender.port_number
         if sender.record_at_other_port(node.number, now, must_move):
             self.forget_plans()
@@ -295,29 +290,22 @@ class Router(Generic[PortT]):
             self._report("route_changed", sender.source, node, former_number)
 
     def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
-        """Return True if a frame with the same bytes as an earlier frame is a copy.
-
-        It may instead be the first command of a restarted program, which numbers its frames from the start again. At
-        the port of the earlier frame, only a late frame (out of sequence) is a copy. At another port, the frame is a
-        copy if that port existed when the earlier frame arrived, and the earlier frame's port still exists. In both
-        cases, the earlier frame must be recent.
-        """
+        """Return True if a frame that equals an earlier frame is a copy of it."""
+        # A restarted program numbers its frames from the start again, so its first command may equal an earlier frame.
+        # A frame that was received at the same port and in sequence is therefore no copy.
         first_port, port_count, received_at = earlier
         if first_port == number:
             return is_late and now - received_at <= REPEAT_WINDOW_S
-        existed_then = number <= port_count  # The port already existed when the earlier frame arrived.
+        existed_then = number <= port_count  # This port already existed when the earlier frame arrived.
         return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
-        """Return True if an equal frame arrived recently at another port, while port ``number`` already existed.
-
-        The frame has then returned through a loop, unless it is a new frame that equals the earlier one by chance.
-        """
+        """Return True if an equal frame arrived at another port recently, while port ``number`` already existed."""
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
 
     def _is_loop(self, node: RouterPort[PortT], source: int, first_port: int, now: float) -> bool:
-        """Count a returning frame. Return True if a loop is proven, now or during the last `LOOP_WINDOW_S`."""
+        """Count a returning frame. Return True while a loop is proven."""
         count = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
         node.echoes[source] = count
         was_proven = now < node.loop_until
@@ -329,19 +317,17 @@ class Router(Generic[PortT]):
         return True
 
     def _record_new(self, node: RouterPort[PortT], source: int) -> None:
-        """Reduce `RouterPort.echoes` of a sender, because a new frame is no echo."""
+        # A new frame is no echo.
         count = node.echoes.pop(source, 0) - 1
         if count > 0:
             node.echoes[source] = count
 
     def _report(self, kind: HubEventKind, source: int, node: RouterPort[PortT], other_number: int) -> None:
-        """Call :attr:`on_change`. The port with ``other_number`` may have been removed."""
         if self.on_change is not None:
             other_node = self._nodes.get(other_number)
             self.on_change(kind, source, node.port, None if other_node is None else other_node.port)
 
     def _record_heartbeat(self, sender: Sender, node: RouterPort[PortT], body: bytes) -> None:
-        """Record the type of a sender, and report an autopilot that is received at a port for the first time."""
         is_first = sender.source in self._unproven
         self._unproven.pop(sender.source, None)
         # At another port, a second sender with the same ids must not turn a vehicle into a ground station.
@@ -358,7 +344,7 @@ class Router(Generic[PortT]):
     # -------------------------------------------------------------------------------------- plans
 
     def _plan(self, node: RouterPort[PortT], key: int) -> ForwardingPlan[PortT]:
-        """Make the plan for ``key``, a key of `RouterPort.plans`, and cache it."""
+        """Make the plan for a key of `RouterPort.plans`, and cache it."""
         message_id, target, source = key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF
         target_system, target_component = target & 0xFF, target >> 8
         ids = target_system, target_component
@@ -405,15 +391,16 @@ class Router(Generic[PortT]):
         return plan
 
     def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
-        """Return the numbers of the ports for a frame to a component or, if it is unknown or 0, to its whole system.
+        """Return the numbers of the ports for a frame to a component, or to a whole system (component 0).
 
-        ``source`` is the sender, ``here`` the number of the port that received the frame. If the sender itself is a
-        target, ``here`` is used as its port. The caller removes ``here``, so that no sender gets its own frame.
+        ``here`` is the number of the port that received the frame.
         """
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None
         if target is not None:
+            # The sender is reached at this port. The caller removes the port, so that no sender gets its own frame.
             return {here: None} if target is origin else dict.fromkeys(target.destinations)
+        # A message for an unknown component goes to its whole system.
         members = [sender for sender in self._senders.values() if sender.system_id == system_id]
         autopilots = [member for member in members if member.is_autopilot]
         numbers: dict[int, None] = {}
@@ -431,7 +418,7 @@ class Router(Generic[PortT]):
         return numbers
 
     def _is_redundant(self, number: int, sender: Sender) -> bool:
-        """Return True if a command of ``sender`` reaches all autopilots of this port elsewhere, or is from one here."""
+        """Return True if this port reaches no autopilot that still needs a command of ``sender``."""
         here = [autopilot for autopilot in self._senders.values() if autopilot.is_autopilot and autopilot.is_at(number)]
         return sender in here or (bool(here) and all(autopilot.port_number != number for autopilot in here))
 

@@ -80,18 +80,14 @@ class Sender:
 
     @property
     def destinations(self) -> Iterable[int]:
-        """Numbers of the ports to which messages for this sender go."""
         return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if this is the sender's port, or if the sender's frames arrive at both ports.
-
-        The last frame here must be at most ROUTE_TIMEOUT_S older than the last frame at the sender's port.
-        """
+        """Return True if this is the sender's port, or if its frames arrive at both ports."""
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:
-        """Record a frame at another port than `port_number`. Return True if the routes to the sender change."""
+        """Record a frame at another port than `port_number`. Return True if the routes change."""
         is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
         if must_move or now - self.received_at > ROUTE_TIMEOUT_S:
@@ -107,10 +103,7 @@ class Sender:
         self.ports = {number: min(now, at + paused_s) for number, at in self.ports.items()}
 
     def record_heartbeat(self, body: bytes) -> bool:
-        """Record from a HEARTBEAT whether the sender belongs to a vehicle, and whether it is an autopilot.
-
-        Return True if either has changed.
-        """
+        """Update `is_vehicle` and `is_autopilot` from a HEARTBEAT. Return True if either has changed."""
         if len(body) <= _AUTOPILOT:  # The payload is too short for a HEARTBEAT.
             return False
         before = self.is_vehicle, self.is_autopilot
@@ -119,7 +112,7 @@ class Sender:
         return before != (self.is_vehicle, self.is_autopilot)
 
     def remove_port(self, number: int) -> bool:
-        """Forget a port that was removed. Return True if the sender is not known at any other port."""
+        """Forget a port. Return True if the sender is not known at any other port."""
         self.reported.discard(number)
         self.ports.pop(number, None)
         if self.port_number == number and self.ports:
@@ -188,7 +181,7 @@ class IdentityGuard:
         self._routes.exclude_pause(now, paused_s)
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Return the first peer without a heartbeat in the last 30 s, or None. Its claims to routes are dropped."""
+        """Return the first peer without a heartbeat in the last 30 s, and drop its claims to routes."""
         silent = (peer for peer in peers if now - self._heartbeat_at.get(peer, -math.inf) > PEER_TTL_S)
         return self._routes.evict_idle_peer(silent, now)
 
@@ -196,10 +189,6 @@ class IdentityGuard:
         self._heartbeat_at.pop(peer, None)
 
     def _publish(self, event: Event) -> None:
-        """Report an event of the routing table as the hub's event "route_changed" or "duplicate_sender".
-
-        A duplicate sender is reported again after `REPEAT_EVENT_S`, even if nothing has changed.
-        """
         if isinstance(event, RouteChanged):
             ids = event.system_id, event.component_id
             self._reported_at.pop(ids, None)  # The peer that owned the ids may now be the duplicate: report it.

@@ -42,7 +42,6 @@ class SharedLink(Link):
         self.dropped_writes: int = 0
 
     async def open(self, receiver: Receiver) -> None:
-        """See `Link.open`. Raises ConnectionClosed or LinkLost if the connection has ended."""
         if self._receiver is not None:
             raise BusyError(f"{self.address} is open; a link can be opened only once")
         self.connection.raise_if_ended()
@@ -54,10 +53,9 @@ class SharedLink(Link):
         ]
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Frames are signed if the connection signs. Frames for this program are dropped."""
         if self._receiver is None:
             return
-        for raw in _frames(data):
+        for raw in _split_frames(data):
             frame = Frame.parse(raw)
             if not self._is_duplicate_reported:
                 self._check_ids(frame)
@@ -76,7 +74,6 @@ class SharedLink(Link):
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; includes bytes that this program itself has sent over the connection."""
         return self.connection.unsent_bytes
 
     def close(self) -> None:
@@ -88,10 +85,9 @@ class SharedLink(Link):
             self._loss_report.cancel()
 
     async def wait_closed(self) -> None:
-        """See `Link.wait_closed`."""
+        """Return at once, because the connection stays open."""
 
     def _check_ids(self, frame: Frame) -> None:
-        """Report a frame of another station with our ids. Both stations would process each other's answers."""
         if (frame.system_id, frame.component_id) == self._ids:
             self._is_duplicate_reported = True
             logger.warning(
@@ -102,14 +98,12 @@ class SharedLink(Link):
             self.connection.bus.publish(DuplicateSender(self.connection.now(), *self._ids))
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
-        """Pass a received frame of the connection to the hub, without its signature."""
         gateway = self._current_gateway()
         if self._receiver is not None:
             unsigned = frame if gateway is None else gateway.strip_signature(frame)
             self._receiver.bytes_received(unsigned.raw, None)
 
     def _on_sent(self, raw: bytes) -> None:
-        """Give the hub a frame that the connection has sent, without its signature."""
         gateway = self._current_gateway()
         if self._receiver is not None:
             unsigned = raw if gateway is None else gateway.strip_signature(Frame.parse(raw)).raw
@@ -128,7 +122,6 @@ class SharedLink(Link):
             receiver.link_lost(lost)
 
     def _current_gateway(self) -> SigningGateway | None:
-        """Return the gateway for the connection's present signing key; None if the connection does not sign."""
         signing: Signing | None = self.connection.signing
         if signing is None:
             self._gateway = None
@@ -137,8 +130,7 @@ class SharedLink(Link):
         return self._gateway
 
 
-def _frames(data: bytes) -> Iterator[bytes]:
-    """Yield the single frames of data that a hub writes."""
+def _split_frames(data: bytes) -> Iterator[bytes]:
     begin = 0
     while begin < len(data):
         payload_length = data[begin + 1]

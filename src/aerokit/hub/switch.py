@@ -70,11 +70,9 @@ class Switch:
         self._poll_interval_s = MIN_POLL_INTERVAL_S
 
     def unix_time(self) -> float:
-        """Return seconds since 1970: the system time at the start, advanced by the loop's clock. It never jumps.
-
-        A later correction of the system time has no effect. This does no harm, because `Signing` uses the newest
-        received stamp if that is later.
-        """
+        """Return the time in seconds since 1970. It never jumps."""
+        # A later correction of the system time has no effect. This does no harm, because `Signing` uses the newest
+        # received stamp if that is later.
         return self._unix_epoch_s + self._clock()
 
     def add(self, port: Port) -> None:
@@ -96,31 +94,29 @@ class Switch:
         self._queueing_ports.clear()
 
     def arrival(self, now: float) -> float:
-        """Return the earliest possible receive time of data that is read now.
-
-        It may have waited in a socket since the loop last ran, or while the computer was suspended.
-        """
+        """Return the earliest possible receive time of data that is read now."""
+        # The data may have waited in a socket since the loop last ran, or while the computer was suspended.
         watch = self._loop_watch
         return watch.arrival(now) if now > watch.late_after else now
 
     def _exclude_pause(self, paused_s: float) -> None:
-        """Do not count a pause of the event loop as a silence of senders, because nothing was read."""
+        # Nothing was read during the pause, so it is no silence of senders.
         now = self._clock()
         self.router.exclude_pause(now, paused_s)
         for guard in {port.guard for port in self.router.ports if port.guard is not None}:
             guard.exclude_pause(now, paused_s)
 
     def _drop_queued_orders(self) -> None:
-        """Drop all commands that wait for full links, because they are too old after the computer was suspended."""
+        # After the computer was suspended, the commands that wait for full links are too old.
         for port in self._queueing_ports:
             port.drop_orders()
 
     def receive(
         self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float, arrived_at: float
     ) -> None:
-        """Forward frames received at a port. ``data`` is the received bytes, or None if not all belong to the frames.
+        """Forward frames received at a port.
 
-        Commands that may have waited too long since ``arrived_at`` are dropped.
+        ``data`` is the received bytes. It is None if some of the bytes do not belong to the frames.
         """
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
@@ -154,7 +150,6 @@ class Switch:
                 self._loop.call_soon(self.flush)
 
     def flush(self) -> None:
-        """Write the batches of all ports."""
         self._is_scheduled = False
         if not self._ports_to_flush:
             return
@@ -168,10 +163,7 @@ class Switch:
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
-        """Return the frames that this sender is allowed to send, and those of them that arrived out of order.
-
-        If the port verifies signatures, the frames are returned without their signatures.
-        """
+        """Return the frames that this sender is allowed to send, and those of them that arrived out of order."""
         admitted: list[Frame] = []
         late: list[Frame] = []
         gateway, guard, peer = port.gateway, port.guard, port.peer
@@ -190,7 +182,6 @@ class Switch:
         return admitted, late
 
     def _without_commands(self, port: Port, frames: list[Frame], arrived_at: float) -> list[Frame]:
-        """Count the commands among the frames as dropped, and return the other frames."""
         remaining = []
         for frame in frames:
             if self._targets.is_command(frame.message_id):
@@ -200,7 +191,7 @@ class Switch:
         return remaining
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
-        """Forward ``data`` in one write if its frames allow this and go to the same ports; otherwise return False."""
+        """Forward ``data`` in one write and return True, or return False if that is not possible."""
         outs = plans[0].outs
         for plan in plans:
             if plan.outs is not outs or not plan.is_plain:
@@ -219,7 +210,6 @@ class Switch:
         return True
 
     def _forward(self, port: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        """Forward one frame: add it to the batch of each port; if a port has none, start a batch or queue the frame."""
         for out in plan.outs:
             if out.batch:
                 out.batch.append(raw)
@@ -233,7 +223,6 @@ class Switch:
             self.recording.write(raw, now)
 
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        """Start the batch of a port with this frame; queue the frame if the port's link has too much unsent data."""
         if out.node is None:
             return  # The port was removed after the frame was routed.
         if out.must_queue():
@@ -248,7 +237,6 @@ class Switch:
             self._ports_to_flush.append(out)
 
     def _forward_limited(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        """Forward one frame to the ports that limit the rate of its message, unless it comes too early."""
         for out, period_s in plan.rate_limited:
             if out.is_due(plan.key, period_s, now):
                 if out.batch:
@@ -257,7 +245,6 @@ class Switch:
                     self._start_batch(out, raw, plan, now)
 
     def _poll(self) -> None:
-        """Write queued frames to the links that accept data again."""
         now, unix_time = self._clock(), self.unix_time()
         self._timer = None
         self._poll_interval_s = min(2 * self._poll_interval_s, MAX_POLL_INTERVAL_S)

@@ -52,7 +52,6 @@ class Endpoint(Snapshot):
     """True to start the hub even if this endpoint cannot be opened yet (a server that starts later), and to retry."""
 
     def _check(self) -> None:
-        """Raise InvalidArgument if a field is invalid."""
         if not isinstance(self.address, (str, Link)):
             raise _not_allowed("address", self.address, "a connection string or a link")
         if isinstance(self.address, str):

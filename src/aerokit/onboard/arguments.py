@@ -51,7 +51,6 @@ class CommandArgument(Snapshot):
     range: Range
 
     def convert(self, value: float) -> object:
-        """Convert a parameter to the argument's type; raise InvalidArgument if its value is not allowed."""
         if not math.isfinite(value):
             if self.is_optional and math.isnan(value):  # NaN means that the parameter is missing.
                 return None
@@ -77,11 +76,9 @@ class CommandArgument(Snapshot):
 
 
 def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
-    """Return the arguments of a handler after the first one, which is the request.
+    """Return the arguments of a handler without the first one, which is the request.
 
-    Raises:
-        InvalidArgument: an annotation is missing or not supported, an argument is not positional, or an argument would
-            be the eighth parameter of the command or a later one.
+    Raises InvalidArgument if the function is not allowed as a handler.
     """
     name = getattr(function, "__name__", repr(function))
     parameters = list(inspect.signature(function).parameters.values())
@@ -119,7 +116,6 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
 
 
 def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandArgument:
-    """Interpret an annotation: a number type, which may be optional, or Annotated with a Range or a Param."""
     allowed = Range()
     is_optional = False
     while (origin := get_origin(hint)) in (Annotated, Union, types.UnionType):  # Each may contain the other.

@@ -72,7 +72,7 @@ def add_autopilot(
 ) -> None:
     """Serve the commands of a vehicle.
 
-    ``set_flight_state(is_armed, custom_mode)`` changes the heartbeat. None leaves the armed state or mode unchanged.
+    ``set_flight_state(is_armed, custom_mode)`` changes the heartbeat. None leaves a value unchanged.
     """
 
     async def call(name: str, *arguments: object) -> None:

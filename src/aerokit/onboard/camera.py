@@ -171,12 +171,10 @@ class CameraDriver:
 
 
 def _implements(camera: CameraDriver, name: str) -> bool:
-    """Return True if the camera's class overrides this method of `CameraDriver`."""
     return overrides(camera, CameraDriver, name)
 
 
 def capabilities_of(camera: CameraDriver) -> int:
-    """Return the CAMERA_CAP_FLAGS that follow from the methods of the camera's class and from its attributes."""
     flags = CameraCapFlags(0)
     if _implements(camera, "take_photo"):
         flags |= CameraCapFlags.CAPTURE_IMAGE
@@ -244,7 +242,6 @@ class CameraAdapter(CameraDevice):
         return storage is None or (storage.is_ready and storage.available_mib > 0)
 
     def expose(self, done: Callable[[Shot | None], None]) -> None:
-        """Take a photo in a task, then call ``done`` with the result, or with None after an error."""
         # The picture gets the time of the command, because the camera does not report the time of its shutter.
         time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
 
@@ -266,7 +263,6 @@ class CameraAdapter(CameraDevice):
         return image.file_url
 
     def storage(self, number: int) -> list[m.StorageInformation]:
-        """Build STORAGE_INFORMATION for a storage id. The list is empty if the camera has no such memory."""
         storage = self._camera.storage()
         if storage is None or number not in (0, 1):  # 0 requests all media.
             return []
@@ -319,11 +315,8 @@ class CameraAdapter(CameraDevice):
         move_to: Callable[[float], Any],
         move_at: Callable[[float], Any],
     ) -> bool:
-        """Move the zoom or the focus; return False if the camera cannot do that.
-
-        One method serves both, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same numbers. A step becomes a
-        move to a percentage.
-        """
+        """Move the zoom or the focus. Return False if the camera cannot do that."""
+        # This method also moves the focus, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same numbers.
         if kind == CameraZoomType.STEP and math.isfinite(current_percent) and math.isfinite(value):
             kind = CameraZoomType.RANGE
             value = max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
@@ -354,7 +347,7 @@ class CameraAdapter(CameraDevice):
 
 
 def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
-    """Return a function that creates the CAMERA_IMAGE_CAPTURED of a photo. Its arguments are the remaining fields."""
+    """Return a function that creates the CAMERA_IMAGE_CAPTURED of a photo from the remaining fields."""
     if not isinstance(photo, Photo):
         raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
     position = photo.position

@@ -97,11 +97,7 @@ class CommandRequest:
 
 
 def outcome_of(value: object) -> Outcome:
-    """Convert the return value of a handler: None and True mean ACCEPTED, False FAILED, a number is a MAV_RESULT.
-
-    Raises:
-        TypeError: COMMAND_ACK cannot carry the value.
-    """
+    """Convert the return value of a handler. Raise TypeError if COMMAND_ACK cannot carry it."""
     if value is None or value is True:
         return Outcome(MavResult.ACCEPTED)
     outcome = Outcome(MavResult.FAILED)
@@ -117,12 +113,10 @@ def outcome_of(value: object) -> Outcome:
 
 
 def overrides(driver: object, base: type, name: str) -> bool:
-    """Return True if the class of a driver overrides a method of its base class."""
     return getattr(type(driver), name) is not getattr(base, name)
 
 
 def result_of(error: BaseException) -> int:
-    """Return the MAV_RESULT for an error of a handler."""
     if isinstance(error, NotSupported):
         return MavResult.UNSUPPORTED
     if isinstance(error, BusyError):
@@ -159,10 +153,10 @@ class ComponentCommands:
         *,
         is_stop: Callable[[ReceivedCommand], bool] = lambda _: False,
     ) -> None:
-        """Register the handler of a MAV_CMD. If ``is_stop`` returns True for a command, a running handler is cancelled.
+        """Register the handler of a MAV_CMD.
 
-        Raises:
-            InvalidArgument: the command already has a handler, or an annotation of the function is not supported.
+        A command for which ``is_stop`` returns True cancels a running handler. Raises InvalidArgument if the command
+        already has a handler, or an annotation of the function is not supported.
         """
 
         def execute(received: ReceivedCommand) -> None:
@@ -174,8 +168,7 @@ class ComponentCommands:
     def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
         """Register handlers of a protocol server, which check the parameters themselves.
 
-        Raises:
-            InvalidArgument: a command already has a handler.
+        Raises InvalidArgument if a command already has a handler.
         """
         for command in handlers:
             if command in self.handlers:
@@ -198,12 +191,15 @@ class ComponentCommands:
         self.add_handlers({command: guard(handler) for command, handler in handlers.items()})
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function of the program, in a thread if it may block (`uses_threads`), and wait for its result."""
+        """Call a function of the program, and wait for its result.
+
+        A plain function runs in a thread if `uses_threads` is True.
+        """
         result = self.begin(function, *arguments)
         return await result if inspect.isawaitable(result) else result
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Begin what `call` does, without waiting: return the result, or an awaitable for it."""
+        """Like `call`, but return the result or an awaitable for it."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             try:
                 return function(*arguments)
@@ -227,7 +223,7 @@ class ComponentCommands:
         return await result if inspect.isawaitable(result) else result
 
     def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
-        """Register a coroutine function of a protocol server. Parameters are passed to it unchecked."""
+        """Register a coroutine function of a protocol server, which checks the parameters itself."""
 
         async def run(request: CommandRequest) -> int:
             return await function(request._command)
@@ -238,7 +234,6 @@ class ComponentCommands:
         self._running.cancel_all()
 
     def close(self) -> None:
-        """End the threads that run no handler."""
         for call in tuple(self.thread_calls):
             call.cancel()  # Nothing waits for its result any more.
         if self._threads is not None:
@@ -252,13 +247,11 @@ class ComponentCommands:
         *,
         is_stop: bool = False,
     ) -> None:
-        """Call a handler, and acknowledge the command when the handler returns, raises or is cancelled."""
         task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
         # `cancel` is called after this method has returned, when `returned` and `running` below are set.
         def cancel() -> bool:
-            """Cancel the handler: its command was cancelled, or the component is closing. False if it cannot be."""
             nonlocal is_cancelled
             if task in self._tasks_in_threads:
                 return False  # The command cannot be cancelled. Its sender gets the result.
@@ -308,7 +301,6 @@ class ComponentCommands:
     async def _finish_when_done(
         self, running: RunningCommand, function: Callable[..., Any], returned: Awaitable[Any]
     ) -> None:
-        """Wait for the result of a handler, and acknowledge the command."""
         try:
             outcome = outcome_of(await returned)
         except asyncio.CancelledError:
@@ -320,7 +312,6 @@ class ComponentCommands:
             self._running.finish(running, outcome)
 
     def _finish_with_error(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
-        """Answer with the result for an error, and explain it in a status text."""
         name = getattr(function, "__name__", "run")
         if name == "run":  # The name of aerokit's own wrapper tells the sender nothing.
             name = command_name(running.command.command)

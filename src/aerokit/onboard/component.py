@@ -96,7 +96,6 @@ class OnboardComponent:
         self._send_heartbeat()
 
     async def _aclose(self) -> None:
-        """Cancel running commands, answer them, and stop."""
         self._commands.cancel_all()
         try:
             await self._tasks.aclose()

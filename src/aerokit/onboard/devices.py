@@ -105,23 +105,17 @@ STATUS_HZ = 5.0
 
 
 def _check_instance(services: ComponentServices, instance: float | None) -> None:
-    """Refuse a command for another component's device. It arrives here too if it was sent to all components.
-
-    A component has one device, which a command can call 1 or the component id. 0 means all devices (DO_GRIPPER in
-    common.xml).
-    """
+    # A command that was sent to all components arrives here, too. A device is number 1 or the component id, and 0 means
+    # all devices (DO_GRIPPER in common.xml).
     if instance not in (None, 0, 1, services.host.component_id):
         raise InvalidArgument(f"instance = {instance} is not allowed: this component has only number 1")
 
 
 def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
-    """Execute DO_WINCH by the driver, and send WINCH_STATUS."""
-
     # The arguments are the parameters of the command, in order.
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
-        """Call the driver's method for the action, with the parameters that the action needs."""
         _check_instance(services, instance)
         method = _WINCH_METHODS.get(action, "")
         if not method or not overrides(winch, WinchDriver, method):
@@ -159,8 +153,6 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
 def add_gripper(
     services: ComponentServices, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]
 ) -> None:
-    """Execute DO_GRIPPER by the two functions."""
-
     # The arguments are the parameters of the command, in order.
     async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
         _check_instance(services, instance)
@@ -181,7 +173,6 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
     """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
-        """Ask the program, and convert its answer or its error to the result of the command."""
         sender_system, _ = request.sender
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).

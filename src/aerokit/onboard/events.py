@@ -20,7 +20,6 @@ _UNAVAILABLE = 0  # MAV_EVENT_ERROR_REASON_UNAVAILABLE
 
 
 def check_severity(severity: int) -> None:
-    """Raise InvalidArgument unless ``severity`` is a MAV_SEVERITY."""
     if not MavSeverity.EMERGENCY <= severity <= MavSeverity.DEBUG:
         raise InvalidArgument(f"severity = {severity} is not allowed: it must be 0 (EMERGENCY) to 7 (DEBUG)")
 
@@ -35,7 +34,6 @@ class EventSender:
         host.on(m.RequestEvent, self._on_request)
 
     def send(self, event_id: int, arguments: bytes, severity: int) -> None:
-        """Send an event to all programs. The first event starts the announcements of sequence numbers."""
         if not 0 <= event_id <= 0xFFFFFFFF:
             raise InvalidArgument(f"event_id = {event_id} is not allowed: it must be 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:
@@ -61,12 +59,11 @@ class EventSender:
             self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _send_sequence(self) -> None:
-        """Announce the last sequence number now and every five seconds, so that receivers notice lost events."""
+        # Receivers notice lost events by the sequence number.
         self._host.send(m.CurrentEventSequence(self._sequence, flags=0))
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
     def _on_request(self, request: m.RequestEvent, sender: Channel) -> None:
-        """Send requested events again; answer with an error if none of them is stored any more."""
         # Sequence numbers have 16 bits and wrap around, so `last_sequence` may be below `first_sequence`.
         count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
         stored = [event for event in self._sent if (event.sequence - request.first_sequence) & 0xFFFF < count]
@@ -80,7 +77,7 @@ class EventSender:
 
 
 def answer_pings(host: ComponentHost) -> None:
-    """Answer PING requests and TIMESYNC requests."""
+    """Answer PING and TIMESYNC requests."""
 
     def on_ping(ping: m.Ping, sender: Channel) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # A PING with a target is an answer.

@@ -82,7 +82,6 @@ class DirectoryFiles:
 
     @property
     def has_root(self) -> bool:
-        """True if a directory is served in addition to the files in memory."""
         return self._root is not None
 
     def __contains__(self, path: str) -> bool:
@@ -94,7 +93,7 @@ class DirectoryFiles:
 
     @_raises_file_fault
     def size(self, path: str) -> int:
-        """Return the size of a file in bytes; 0 for a path that is not a regular file."""
+        """Return the size of a file in bytes; 0 for anything other than a regular file."""
         if path in self._memory:
             return self._memory.size(path)
         status = self._path(path).lstat()
@@ -102,7 +101,6 @@ class DirectoryFiles:
 
     @_raises_file_fault
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
-        """Open a regular file."""
         if path in self._memory:
             if writing:
                 raise FileFault(EROFS)
@@ -124,7 +122,7 @@ class DirectoryFiles:
 
     @_raises_file_fault
     def entries(self, path: str) -> list[Entry]:
-        """Return the regular files and directories in a directory, at most `MAX_ENTRIES`, sorted by name."""
+        """Return the names and sizes of files and directories, at most `MAX_ENTRIES`."""
         sizes: dict[str, int | None] = {}  # None for directories
         if self._root is not None:
             try:
@@ -172,7 +170,6 @@ class DirectoryFiles:
         self._writable(path).rmdir()
 
     def _writable(self, path: str) -> Path:
-        """Return the path below the root; raise FileFault unless clients may change it."""
         if not self._is_writable or path in self._memory:
             raise FileFault(EROFS)
         target = self._path(path)
@@ -181,7 +178,7 @@ class DirectoryFiles:
         return target
 
     def _path(self, path: str) -> Path:
-        """Return the path below the root; raise FileFault if it leaves the root or contains a symbolic link."""
+        """Return a path below the root. Raise FileFault if it leaves the root or contains a symbolic link."""
         if self._root is None:
             raise FileFault(ENOENT)
         target = self._root

@@ -65,16 +65,14 @@ class ComponentHost:
 
     @property
     def now(self) -> float:
-        """Loop time in seconds."""
         return self.connection.now()
 
     @property
     def time_boot_ms(self) -> int:
-        """Milliseconds since the component started."""
         return int((self.now - self._started_at) * 1000.0) & 0xFFFFFFFF
 
     def on(self, message_class: type[Message], handler: Handler) -> None:
-        """Call ``handler(message, sender)`` for each message to this component or to all, except late orders."""
+        """Call ``handler(message, sender)`` for each message to this component or to all."""
 
         def on_message(message: Message) -> None:
             sender = sender_of(message)
@@ -84,7 +82,6 @@ class ComponentHost:
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
 
     def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
-        """Return True if this component must process a message from this sender."""
         sender_system, _ = sender
         if sender == (self.system_id, self.component_id) or sender_system == 0:  # System id 0 is not a valid sender.
             return False
@@ -100,7 +97,7 @@ class ComponentHost:
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 
     def _is_late(self, message: Message) -> bool:
-        """Return True for a message that makes the component act, if it may have waited too long in a blocked loop."""
+        """Return True for an order that may have waited too long in a blocked loop."""
         frame = message.received_frame
         age_s = 0.0 if frame is None else self.now - frame.received_at
         if message.ID not in _ORDER_MESSAGE_IDS or age_s <= MAX_COMMAND_AGE_S:
@@ -110,9 +107,9 @@ class ComponentHost:
         return True
 
     def send(self, message: Message, channel: Channel = None) -> None:
-        """Send a message. Does nothing after the connection ended.
+        """Send a message to the system of ``channel``; None means all systems.
 
-        ``channel`` has the ids of the receiving component, whose whole system gets the message; None: all systems.
+        Does nothing after the end of the connection.
         """
         if self._is_closed or not self.connection.is_open:
             return
@@ -125,7 +122,6 @@ class ComponentHost:
             self.connection.send_as(self._encoder, message, to=to)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT to all programs. A text of more than 50 characters is sent in chunks."""
         printable = "".join(char if char.isprintable() else " " for char in text)
         text = printable.encode("ascii", "replace").decode()[:MAX_TEXT_SIZE]
         if len(text) <= CHUNK_SIZE:
@@ -139,15 +135,13 @@ class ComponentHost:
             self.send(m.Statustext(severity, "", id=self._text_id, chunk_seq=len(text) // CHUNK_SIZE))
 
     def report_error(self, subject: str, error: BaseException) -> None:
-        """Send an exception of the program's code as a status text, and log it unless it is an AerokitError."""
+        """Send an exception of the program's code as a status text."""
         text = f"{subject}: {error_text(error)}"
         if not isinstance(error, AerokitError):
             logger.error("component %d/%d: %s", self.system_id, self.component_id, text, exc_info=error)
         self.send_text(MavSeverity.WARNING, text)
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a loop time, unless the component has ended."""
-
         def alarm() -> None:
             if not self._is_closed:
                 self._guarded(action)
@@ -158,18 +152,15 @@ class ComponentHost:
         self.call_at(self.now + delay, action)
 
     def stop_receiving(self) -> None:
-        """Ignore all messages from now on. Sending continues."""
         for detach in self._detachments:
             detach()
         self._detachments.clear()
 
     def close(self) -> None:
-        """Stop processing and sending."""
         self._is_closed = True
         self.stop_receiving()
 
     def _guarded(self, action: Callable[[], Any]) -> None:
-        """Run code of a protocol server. An exception is logged, and the component continues."""
         try:
             action()
         except AerokitError as error:
@@ -179,5 +170,4 @@ class ComponentHost:
 
 
 def error_text(error: BaseException) -> str:
-    """Return the text of an exception, or the name of its type if it has none."""
     return str(error) or type(error).__name__

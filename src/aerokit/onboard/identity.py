@@ -71,7 +71,6 @@ class IdentityMessages:
         self._host, self._identity, self._memory = host, identity, memory
 
     def builders(self) -> dict[int, Builder]:
-        """Return the function that builds each message, by message id."""
         return {
             m.AutopilotVersion.ID: lambda _: [self._version()],
             m.ComponentInformationBasic.ID: lambda _: [self._basic()],
@@ -79,7 +78,6 @@ class IdentityMessages:
         }
 
     def _version(self) -> m.AutopilotVersion:
-        """Build AUTOPILOT_VERSION."""
         identity = self._identity
         return m.AutopilotVersion(
             capabilities=self.capabilities,
@@ -96,7 +94,6 @@ class IdentityMessages:
         )
 
     def _basic(self) -> m.ComponentInformationBasic:
-        """Build COMPONENT_INFORMATION_BASIC."""
         identity = self._identity
         return m.ComponentInformationBasic(
             time_boot_ms=self._host.time_boot_ms,
@@ -128,6 +125,6 @@ class IdentityMessages:
         return [m.ComponentMetadata(time_boot_ms=self._host.time_boot_ms, file_crc=checksum, uri=uri)]
 
     def add_metadata(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
-        """Serve a metadata file. ``content()`` returns its content; it is called again for each COMPONENT_METADATA."""
+        """Serve a metadata file. ``content()`` is called again for each COMPONENT_METADATA."""
         self.metadata[kind] = (path, content)
         self.update_files()

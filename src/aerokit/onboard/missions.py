@@ -102,7 +102,7 @@ class ComponentMissions:
     def _accept_or_refuse(
         self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]
     ) -> None:
-        """Ask the program's function about an upload, and call ``answer`` with the MAV_MISSION_RESULT, now or later."""
+        """Call ``answer`` with the MAV_MISSION_RESULT of an upload, now or later."""
         kind = next(name for name, number in _TYPES_BY_KIND.items() if number == mission_type)
         function = self._on_upload
         verdict: Any = None
@@ -136,7 +136,6 @@ class ComponentMissions:
         return MavMissionResult.INVALID if is_invalid else MavMissionResult.ERROR
 
     def _set_current(self, index: int) -> bool:
-        """Ask the program to continue the mission at an item; return False if it refuses."""
         if self._on_current is None:
             return False
         try:
@@ -154,7 +153,7 @@ class ComponentMissions:
 
 
 def _result_of(verdict: object) -> int:
-    """Convert what a function returned: an integer is the MAV_MISSION_RESULT, False is DENIED, all else ACCEPTED."""
+    """Convert the return value of the program's function to a MAV_MISSION_RESULT."""
     if verdict is False:
         return MavMissionResult.DENIED
     if isinstance(verdict, int) and not isinstance(verdict, bool):

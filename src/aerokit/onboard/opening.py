@@ -141,7 +141,6 @@ async def component(
 
 
 def _heartbeat(type_: int, autopilot: int) -> Heartbeat:
-    """Return the first heartbeat of a component."""
     for name, value in (("type", type_), ("autopilot", autopilot)):
         if not 0 <= value <= 255:
             raise InvalidArgument(f"{name} = {value} is not allowed: it must be 0 to 255")

@@ -143,10 +143,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             self._param_ext_server = TypedExtendedServer(self._host, _Store(self))
 
     def _forbid_parameters(self) -> None:
-        """Refuse :meth:`add` from now on, because the settings of a camera definition need PARAM_EXT for themselves.
-
-        InvalidArgument if there are parameters already.
-        """
+        """Refuse :meth:`add` from now on. Raise InvalidArgument if there are parameters already."""
+        # The settings of a camera definition need PARAM_EXT for themselves.
         if self._rows:
             raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         self._has_camera_settings = True
@@ -182,7 +180,6 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return self._rows[name]
 
     def _checked(self, row: _Row, value: object) -> ParameterValue:
-        """Return the value in the parameter's type; raise InvalidArgument if it is not allowed."""
         metadata, name = row.metadata, row.metadata.name
         if isinstance(value, bool):
             raise InvalidArgument(f"{name} = {value!r} is not allowed: a parameter cannot be a bool")
@@ -203,14 +200,13 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return checked
 
     def _store(self, name: str, value: ParameterValue) -> None:
-        """Store a checked value. If it has changed and there is a file, save it; a running save writes it again."""
         row = self._rows[name]
         if settings_equal(row.value, value):
             return
         row.value = value
         if self._path is not None:
             self._is_dirty = True
-            if self._save_task is None:
+            if self._save_task is None:  # A running task writes the file again.
                 self._save_task = asyncio.get_running_loop().create_task(self._save(self._path))
 
     def _file_text(self) -> str:
@@ -218,11 +214,11 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return json.dumps({**self._stored, **values}, indent=1) + "\n"
 
     async def _save(self, path: Path) -> None:
-        """Write the file, and again after changes during the write. Uses a thread, because memory cards are slow."""
         try:
             while self._is_dirty:
                 self._is_dirty = False
                 write = partial(write_atomically, path, self._file_text())
+                # Memory cards are slow.
                 await asyncio.get_running_loop().run_in_executor(None, write)
         except OSError as error:
             self._is_dirty = True
@@ -269,11 +265,7 @@ class _Store:
         return self._parameters._rows[name].type
 
     def problem(self, name: str, value: object, type: int) -> tuple[int, int] | None:  # noqa: A002
-        """Check a value, and offer it to the program's ``on_set``. Return None if it is accepted.
-
-        Otherwise return the MAV_PARAM_ERROR and the PARAM_ACK with which the server refuses the value. The text of the
-        exception, if there was one, is sent as a status text.
-        """
+        """Return None if a value is accepted, otherwise the MAV_PARAM_ERROR and the PARAM_ACK for it."""
         row = self._parameters._rows[name]
         if row.metadata.read_only:
             return MavParamError.READ_ONLY, ParamAck.FAILED
@@ -296,12 +288,11 @@ class _Store:
 
 
 def _rounded_limit(limit: float | None, default: ParameterValue) -> float | None:
-    """Round a float parameter's limit to 32 bits. Values are rounded too, so a value at the limit is allowed."""
+    # Values are rounded to 32 bits, so a value at the limit is allowed only if the limit is rounded, too.
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 
 def _metadata_entry(row: _Row) -> dict[str, Any]:
-    """Return the entry of a parameter in the metadata file, without empty fields."""
     metadata = row.metadata
     entry: dict[str, Any] = {
         "name": metadata.name,
@@ -318,7 +309,6 @@ def _metadata_entry(row: _Row) -> dict[str, Any]:
 
 
 def _read_stored(path: Path | None) -> dict[str, Any]:
-    """Return the stored values; an empty dictionary if there is no file yet."""
     if path is None or not path.exists():
         return {}
     try:

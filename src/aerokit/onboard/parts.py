@@ -40,12 +40,11 @@ class DefinedSettings(DefinedParameterServer):
         self._component = host
 
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        """See `DefinedParameterServer.set`. If the program's function raises, the old value stays."""
         old_value = self.values.get(name)
         try:
             return super().set(name, data, kind)
         except Exception as error:
-            assert old_value is not None
+            assert old_value is not None  # The program's function has refused the new value.
             self.values[name] = old_value
             self._component.report_error(name, error)
             wire_type = self.definition.settings[name].wire_type
@@ -56,7 +55,6 @@ class DefinedSettings(DefinedParameterServer):
 
 
 def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapter:
-    """Serve the camera protocol for the program's camera."""
     host, streams = services.host, services.streams
     adapter = CameraAdapter(camera, host, services.tasks, services.commands.call)
     if m.CameraInformation.ID in streams.builders:
@@ -85,7 +83,6 @@ async def _run_if_implemented(handler: AsyncHandler, command: ReceivedCommand) -
 
 
 def add_gimbal(services: ComponentServices, gimbal: GimbalDriver) -> GimbalAdapter:
-    """Serve the gimbal protocol for the program's gimbal."""
     streams = services.streams
     if m.GimbalManagerInformation.ID in streams.builders:
         raise InvalidArgument("this component already has a gimbal: open another component for the second one")

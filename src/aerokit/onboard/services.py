@@ -44,7 +44,6 @@ class ComponentServices:
         """Motions that go on until the next command: the program's function that stops each, by the part's name."""
 
     async def stop_motions(self) -> None:
-        """Stop all motions, because no command can stop them after the end of the component. Errors are reported."""
         thread_calls = set(self.commands.thread_calls)
         motions = dict(self.motions)
         self.motions.clear()
@@ -64,8 +63,7 @@ class ComponentServices:
     def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:
         """Send the message that ``function`` returns: on request, and at a rate of ``hz``.
 
-        Raises:
-            InvalidArgument: the rate is not 0 to 200 Hz, or the message already has a function.
+        Raises InvalidArgument if the rate is not 0 to 200 Hz, or the message already has a function.
         """
         if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
             raise InvalidArgument(f"hz = {hz} is not allowed: it must be 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
@@ -75,7 +73,6 @@ class ComponentServices:
         is_failing = False
 
         def build(_: object) -> Iterable[Message]:
-            """Return the message that ``function`` returns; no message if it returns None or raises an exception."""
             nonlocal is_failing
             try:
                 message = function()
