@@ -223,10 +223,11 @@ class Parameters(ReadOnly):
         Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. Call
         ``download(refresh=True)`` first if another station may have set values that your program has not received.
 
-        ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
-        one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; a parameter that the vehicle does not have gets the outcome ``"failed"`` and a
-        ParameterRejected, and all other parameters are set. If two names mean the same parameter, the value under the
+        ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back. ``"set"`` sets them one by
+        one. ``"auto"`` uses the file if the vehicle supports it and there are many changes.
+
+        Results are as for :meth:`set_many`. A parameter that the vehicle does not have gets the outcome ``"failed"``
+        and a ParameterRejected; all others are set. If two names mean the same parameter, the value under the
         vehicle's current name is used, and the other name gets no result.
 
         Raises:

@@ -97,7 +97,7 @@ class NameResolver:
         return translated
 
     def without_duplicates(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
-        """Drop each value that is also given under the vehicle's own name of the parameter."""
+        """Drop a value if ``values`` also has the parameter under the name that the vehicle uses."""
         from aerokit.parameters.renames import resolve_rename
 
         remaining = {}
@@ -203,7 +203,7 @@ def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) 
     is_old_value = old is not None and same_value(old.value, answer.value)
     if same_value(answer.value, sent.value):
         return "unchanged" if is_old_value else "set"
-    if is_old_value:  # This takes precedence over rounding, because PX4 transfers integers exactly.
+    if is_old_value:  # This is no rounding, even if the values are close, because PX4 receives integers exactly.
         kept = number_text(answer.value) if math.isfinite(answer.value) else answer.value
         text = f"{sent.name} = {number_text(sent.value)} was refused: the vehicle keeps {kept}"
         return ParameterRejected(text, name=sent.name)
@@ -259,7 +259,7 @@ class ParameterWriter:
     ) -> dict[str, ParameterWrite]:
         """Write the values, and return a result for each.
 
-        ``upload`` is the method of an upload, which sends only changed values. None sends all values by PARAM_SET.
+        With ``upload``, only changed values are sent, by this method. Otherwise, all values are sent by PARAM_SET.
         ``resolve`` is called instead of :meth:`NameResolver.resolve`.
         """
         resolve = resolve or self.names.resolve
@@ -303,7 +303,7 @@ class ParameterWriter:
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
         """Return the planned writes and the errors.
 
-        In the first round, an invalid value raises InvalidArgument.
+        ``is_first`` is True in the first round of writes. An invalid value then raises InvalidArgument.
         """
         plans: list[_PlannedWrite] = []
         first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
