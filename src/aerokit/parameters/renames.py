@@ -18,8 +18,8 @@ from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OTHER_NEW_NAMES, REPLACED
 
-# The value 1 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
-_ALL_BIT = 1  # This single bit of ARMING_CHECK enables all checks.
+# Bit 0 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
+_ALL_BIT = 1
 _SINGLE_CHECKS = 0x1FFFFE
 _SKIP_ALL = -1
 

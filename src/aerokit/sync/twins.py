@@ -1471,9 +1471,9 @@ class Files(TwinOf["AsyncFiles"]):
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than the part. After such a resumed download, aerokit compares the CRC-32 of the copy with that of
-        the vehicle's file, if the vehicle can compute it; if they differ, the whole file is read again. Files whose
-        names begin with ``@`` are always read completely.
+        is shorter than the part. After a resumed download, aerokit compares the CRC-32 of both files, if the vehicle
+        can compute it. If they differ, the whole file is read again. Files whose names begin with ``@`` are always read
+        completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -1941,7 +1941,7 @@ class Gripper(TwinOf["AsyncGripper"]):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
     Enable it by PD_GRIPPER_EN on PX4, by GRIP_ENABLE on ArduPilot. PX4 acknowledges when the gripper has moved.
-    ArduPilot acknowledges at once and reports the end by a status text; for an electro-permanent gripper it reports
+    ArduPilot acknowledges at once and reports the end by a status text. For an electro-permanent gripper, it reports
     only the start, and the call returns three seconds later. Orders are sent once. If you cancel a call, the gripper
     may still have moved.
     """
@@ -2168,8 +2168,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
-    the end.
+    while it reads more than five parameters. For names that are not known yet, it raises the rate after half a second.
+    It restores the rate at the end.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -3554,7 +3554,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return those options of a setting, as {name: value}, that the known values of other settings allow.
+        """Return the options of a setting that the known values of other settings allow, as {name: value}.
 
         Empty without a definition, and for settings without options.
         """

@@ -51,9 +51,9 @@ class ComponentStatus(Snapshot):
     """One component of the vehicle's system.
 
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
-    MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. A camera or gimbal without a component id of its own
-    has a ``device_id`` from 1 to 6, and the ``component_id`` of the component to which it is attached; otherwise,
-    ``device_id`` is 0. ``received_at`` is the loop time of the component's last message.
+    MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. ``device_id`` is 1 to 6 for a camera or gimbal without
+    its own component id, otherwise 0. The ``component_id`` of such a device is that of the component to which it is
+    attached. ``received_at`` is the loop time of the component's last message.
     """
 
     component_id: int

@@ -154,7 +154,7 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return those options of a setting, as {name: value}, that the known values of other settings allow.
+        """Return the options of a setting that the known values of other settings allow, as {name: value}.
 
         Empty without a definition, and for settings without options.
         """

@@ -235,7 +235,7 @@ class LogChannel:
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._lock = asyncio.Lock()
-        # The task that waits until the end of the last failed operation is confirmed; None if no operation has failed.
+        # Task that waits until the vehicle confirms the end of the last failed operation; None if none has failed.
         self._ending: asyncio.Task[None] | None = None
 
     async def list(

@@ -40,7 +40,7 @@ STILL_S, STILL_DEG = 0.4, 0.5
 
 
 class Angles(NamedTuple):
-    """Angles in degrees. None means: in an attitude, that the angle is unknown; in a target, that any is accepted."""
+    """Angles in degrees. In an attitude, None is an unknown angle. In a target, None accepts any angle."""
 
     pitch: float | None
     roll: float | None
