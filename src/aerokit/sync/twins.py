@@ -974,8 +974,8 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
     releases control, without waiting if the block exits by an error or cancellation. When another station takes
     control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken if your program does
-    not know of the loss yet, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
+    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken unless your program
+    already knows of the loss, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
     system and component id cannot be detected.
 
     Entering raises:
@@ -2657,7 +2657,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
             OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
-                fell silent before anything was sent.
+                fell silent before the item was sent.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)
 
@@ -3610,13 +3610,12 @@ class Settings(TwinOf["AsyncSettings"]):
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        If the camera definition is loaded, ``value`` may be the name of an option. Settings that restrict this setting
-        are then read first if their values are unknown. Settings that the camera may have changed are read again
-        afterwards.
+        If the camera definition is loaded, ``value`` may be the name of an option. Unknown settings that restrict this
+        setting are then read first. Settings that the camera may have changed are read again afterwards.
 
         Raises:
-            InvalidArgument: the name or value is invalid. By the definition, the value is not allowed, or the setting
-                is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid, or the definition does not allow this value now. Nothing was
+                set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is the PARAM_ACK in its answer.
             ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that the
                 camera may have changed could not be read again.

@@ -232,13 +232,12 @@ class Settings:
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        If the camera definition is loaded, ``value`` may be the name of an option. Settings that restrict this setting
-        are then read first if their values are unknown. Settings that the camera may have changed are read again
-        afterwards.
+        If the camera definition is loaded, ``value`` may be the name of an option. Unknown settings that restrict this
+        setting are then read first. Settings that the camera may have changed are read again afterwards.
 
         Raises:
-            InvalidArgument: the name or value is invalid. By the definition, the value is not allowed, or the setting
-                is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid, or the definition does not allow this value now. Nothing was
+                set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is the PARAM_ACK in its answer.
             ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that the
                 camera may have changed could not be read again.

@@ -155,8 +155,8 @@ class GimbalControl:
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
     releases control, without waiting if the block exits by an error or cancellation. When another station takes
     control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken if your program does
-    not know of the loss yet, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
+    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken unless your program
+    already knows of the loss, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
     system and component id cannot be detected.
 
     Entering raises:

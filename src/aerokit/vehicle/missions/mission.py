@@ -274,7 +274,7 @@ class MissionControl(VehiclePlan["Mission"]):
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
             OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
-                fell silent before anything was sent.
+                fell silent before the item was sent.
         """
         self._check_item(item)
         with self._vehicle_context.arbiter.auxiliary_order() as order:

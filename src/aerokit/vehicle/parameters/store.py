@@ -33,8 +33,7 @@ class ParameterStore:
 
     def __init__(self, transfers: Transfers, on_discarded: Callable[[str, float], None]) -> None:
         self._transfers = transfers
-        # Called after a message was ignored, with the parameter's name and the time until which the old value is
-        # ignored.
+        # Called for each ignored message with the parameter's name and the time until which its old value is ignored.
         self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table; None until it is built again after a change.

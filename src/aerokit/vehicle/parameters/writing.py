@@ -197,18 +197,22 @@ def _failed_write(name: str, requested: float, known: Parameter | None, error: A
     return ParameterWrite(name, requested, value, type_, outcome="failed", error=error)
 
 
-def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
+def outcome_of(
+    sent: Parameter, old: Parameter | None, answer: ParameterAnswer, *, bytewise: bool
+) -> Outcome | AerokitError:
     if not isinstance(answer, Parameter):
         return answer
     is_old_value = old is not None and same_value(old.value, answer.value)
     if same_value(answer.value, sent.value):
         return "unchanged" if is_old_value else "set"
-    if is_old_value:  # This is no rounding, even if the values are close, because PX4 receives integers exactly.
+    # A 32-bit float cannot represent all integers. Those that are sent bytewise are exact.
+    is_rounded = to_float32(answer.value) == to_float32(sent.value)
+    if is_old_value and (bytewise or not is_rounded):
         kept = number_text(answer.value) if math.isfinite(answer.value) else answer.value
         text = f"{sent.name} = {number_text(sent.value)} was refused: the vehicle keeps {kept}"
         return ParameterRejected(text, name=sent.name)
-    if to_float32(answer.value) == to_float32(sent.value):
-        return "rounded"  # The requested value is an integer that a 32-bit float cannot represent exactly.
+    if is_rounded:
+        return "rounded"
     difference = abs(answer.value - sent.value)
     if answer.type.is_integer:
         is_near = difference < MAX_INTEGER_ROUNDING
@@ -327,7 +331,7 @@ class ParameterWriter:
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
         name, requested = plan.resolved.requested, plan.requested
         answer = answers[plan.to_send.name]
-        outcome = outcome_of(plan.to_send, plan.old, answer)
+        outcome = outcome_of(plan.to_send, plan.old, answer, bytewise=self._access.store.bytewise)
         if isinstance(outcome, AerokitError):
             return _failed_write(name, requested, plan.resolved.as_requested(plan.old), outcome)
         assert isinstance(answer, Parameter)  # For all other answers, the outcome is an error.

@@ -86,8 +86,7 @@ class VehicleWatch:
         self._first_time: tuple[int, float] | None = None
         # By this clock, the connection recognises a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # Maps each clock to a time that has decreased, and when it was processed. Later messages show whether this was
-        # a reboot.
+        # Maps each clock to a time that has decreased, and when it was processed. Later messages may confirm it.
         self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
         # Our time when the last answer to a TIMESYNC request was processed, and the vehicle's time in it (ms).
@@ -232,7 +231,7 @@ class VehicleWatch:
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        # Discard the times from before the reboot, because later messages would show the same reboot again.
+        # Discard older times: later messages that are compared with them would show the same reboot again.
         self._last_times = {clock: (milliseconds, now)}
         self._decreased_times = {}
         self._first_time = None
