@@ -2202,7 +2202,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         The metadata of PX4 contains the defaults.
 
         Raises:
-            FileFormatError: the file is damaged, or of another kind.
+            FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
         """
         return self.aio.load_metadata(path)
 
@@ -3516,7 +3516,8 @@ class Settings(TwinOf["AsyncSettings"]):
             locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
 
         Raises:
-            FileFormatError: the file is invalid, or has more than 16 MB. The previous definition stays.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition stays.
+            OSError: the file cannot be read.
         """
         return self._loop.call(self.aio.load, definition, locale=locale)
 
@@ -3541,7 +3542,7 @@ class Settings(TwinOf["AsyncSettings"]):
             NotSupported: the camera names no definition file.
             CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
-            FileFormatError: the file is invalid, or has more than 16 MB.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
             OperationRejected: the web server failed.
         """

@@ -103,7 +103,8 @@ class Settings:
             locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
 
         Raises:
-            FileFormatError: the file is invalid, or has more than 16 MB. The previous definition stays.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition stays.
+            OSError: the file cannot be read.
         """
         from aerokit.parameters import load_definition
 
@@ -135,7 +136,7 @@ class Settings:
             NotSupported: the camera names no definition file.
             CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
-            FileFormatError: the file is invalid, or has more than 16 MB.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
             OperationRejected: the web server failed.
         """

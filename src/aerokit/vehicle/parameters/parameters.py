@@ -95,7 +95,7 @@ class Parameters(ReadOnly):
         The metadata of PX4 contains the defaults.
 
         Raises:
-            FileFormatError: the file is damaged, or of another kind.
+            FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
         """
         from aerokit.parameters import load_metadata
 
