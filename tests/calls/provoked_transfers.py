@@ -108,6 +108,7 @@ def _parameters() -> Table:
         ("Parameters.load_metadata", "FileFormatError"): P(_load),
         ("Parameters.load_metadata", "OSError"): P(_load_missing),
         ("Parameters.upload", "FileFormatError"): P(_of("parameters", "upload", _damaged)),
+        ("Parameters.upload", "OSError"): P(_of("parameters", "upload", NOWHERE)),
         ("Parameters.upload", "ParameterRejected"): P(_upload_unknown),
         ("Parameters.temporarily", "RollbackFailed"): P(
             lambda s: _silent_in(s, s.vehicle.parameters.temporarily({s.parameter: s.other_value() + 1}, **PATIENCE))

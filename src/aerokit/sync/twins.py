@@ -2340,6 +2340,7 @@ class Parameters(TwinOf["AsyncParameters"]):
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
+            OSError: the file cannot be read. Nothing was set.
             ParameterTimeout: the vehicle's own parameters could not be downloaded.
         """
         return self._loop.run(

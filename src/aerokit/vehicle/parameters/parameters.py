@@ -232,6 +232,7 @@ class Parameters(ReadOnly):
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
+            OSError: the file cannot be read. Nothing was set.
             ParameterTimeout: the vehicle's own parameters could not be downloaded.
         """
         with self._transfers.limit(timeout):
