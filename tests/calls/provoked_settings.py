@@ -28,6 +28,10 @@ async def _load_damaged(stage: Stage) -> None:
     settings_of(stage).load(path)
 
 
+async def _load_missing(stage: Stage) -> None:
+    settings_of(stage).load(stage.local("missing.xml"))
+
+
 def _camera(*troubles: Callable[[SimulatedCamera], object]) -> Callable[[Stage], None]:
     """Add a camera to the vehicle, then apply the troubles to it."""
 
@@ -79,6 +83,7 @@ HURRY: dict[str, Any] = {"timeout": 0.05}
 
 SETTINGS: Table = {
     ("Settings.load", "FileFormatError"): P(_load_damaged),
+    ("Settings.load", "OSError"): P(_load_missing),
     ("Settings.fetch_definition", "NotSupported"): P(_call("fetch_definition"), _names("")),
     ("Settings.fetch_definition", "CommandRejected"): P(_call("fetch_definition"), _lacks_information),
     ("Settings.fetch_definition", "OperationTimeout"): P(_call("fetch_definition", **HURRY), _silent),

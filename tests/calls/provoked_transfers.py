@@ -60,6 +60,10 @@ async def _load(stage: Stage) -> None:
     stage.vehicle.parameters.load_metadata(_damaged(stage))
 
 
+async def _load_missing(stage: Stage) -> None:
+    stage.vehicle.parameters.load_metadata(stage.local("missing.xml"))
+
+
 async def _upload_unknown(stage: Stage) -> None:
     """The error is in the result."""
     result = (await stage.vehicle.parameters.upload({"NOSUCH_PARAM": 1.0}))["NOSUCH_PARAM"]
@@ -102,7 +106,9 @@ def _parameters() -> Table:
         ),
         ("Parameters.changed_from_default", "NotSupported"): P(_of("parameters", "changed_from_default"), on="px4"),
         ("Parameters.load_metadata", "FileFormatError"): P(_load),
+        ("Parameters.load_metadata", "OSError"): P(_load_missing),
         ("Parameters.upload", "FileFormatError"): P(_of("parameters", "upload", _damaged)),
+        ("Parameters.upload", "OSError"): P(_of("parameters", "upload", NOWHERE)),
         ("Parameters.upload", "ParameterRejected"): P(_upload_unknown),
         ("Parameters.temporarily", "RollbackFailed"): P(
             lambda s: _silent_in(s, s.vehicle.parameters.temporarily({s.parameter: s.other_value() + 1}, **PATIENCE))

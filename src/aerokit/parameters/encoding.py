@@ -62,12 +62,12 @@ def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float: 
 
 
 def to_wire(value: float, type: ParameterType, bytewise: bool) -> float:  # noqa: A002
-    """Encode a value as ``param_value``. The bits of a signalling NaN change."""
+    """Encode a value as ``param_value``. Inexact for a signalling NaN: use :func:`set_message` to send a value."""
     return float(_FLOAT.unpack(to_bits(value, type, bytewise))[0])
 
 
 def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode a ``param_value``. The bits of a signalling NaN have changed."""
+    """Decode a ``param_value``. Inexact for a signalling NaN: use :func:`value_of` for a received message."""
     if bytewise and type in _FORMATS:
         return from_bits(_FLOAT.pack(param_value), type, bytewise)
     return _cast(param_value, type)

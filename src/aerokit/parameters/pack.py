@@ -140,8 +140,9 @@ def pack_for_download(
 ) -> bytes:
     """Encode ``@PARAM/param.pck`` for these parameters, without validating their values.
 
-    ``block_size`` is the number of data bytes per read (a block). ``count`` 0 means all parameters from ``start`` on.
-    InvalidArgument is raised if ``start`` is beyond the list.
+    ``count`` 0 means all parameters from ``start`` on. ``block_size`` is the number of data bytes per read. With
+    ``whole_defaults``, a value and its default are in the same block. InvalidArgument is raised if ``start`` is beyond
+    the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
@@ -155,9 +156,9 @@ def pack_for_download(
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
-        # The last `unsplit_size` bytes of the entry, its value or values, must not be split between two blocks.
-        # PX4 keeps a value and its default in the same block. ArduPilot (``whole_defaults=False``) only keeps the last
-        # of them unsplit, so a value may be split if a default follows it (AP_Filesystem_Param.cpp).
+        # The last `unsplit_size` bytes of the entry must be in one block. For PX4, these are the value and its default.
+        # For ArduPilot (``whole_defaults=False``), they are the last number only. A value may be split if a default
+        # follows it (AP_Filesystem_Param.cpp).
         _, value_format = _CODES[code]
         unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size

@@ -158,7 +158,7 @@ def to_float32(value: float) -> float:
 
 
 def same_value(left: float, right: float) -> bool:
-    """Return True if the values are equal, equal as 32-bit floats, or both NaN."""
+    """Return True if the values are equal or both NaN. They are compared as 32-bit floats, unless both are ints."""
     are_both_nan = left != left and right != right
     if left == right or are_both_nan:
         return True
@@ -260,7 +260,7 @@ def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noq
 
 
 def settings_equal(left: SettingValue, right: SettingValue) -> bool:
-    """Return True if the values are equal, equal as 32-bit floats, or both NaN."""
+    """Return True if two texts are equal, or if two numbers are equal according to :func:`same_value`."""
     if isinstance(left, (str, bytes)) or isinstance(right, (str, bytes)):
         return _encoded(left) == _encoded(right)
     return same_value(left, right)

@@ -18,8 +18,8 @@ from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OTHER_NEW_NAMES, REPLACED
 
-# The value 1 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
-_ALL_BIT = 1  # This single bit of ARMING_CHECK enables all checks.
+# Bit 0 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
+_ALL_BIT = 1
 _SINGLE_CHECKS = 0x1FFFFE
 _SKIP_ALL = -1
 
@@ -171,12 +171,12 @@ def translate_values(
     known: Container[str],
     types: Mapping[str, ParameterType] = MappingProxyType({}),
 ) -> tuple[dict[str, int | float], tuple[Renamed, ...]]:
-    """Convert the values of a file or table to the names and units that a vehicle uses; ``known`` are its names.
+    """Convert the values of a file or table to the names and units that a vehicle uses.
 
-    A parameter that the vehicle does not have, whether under this name or another, keeps its name and value. If
-    ``values`` has a parameter under several names, the value under the vehicle's name is used, or the last value if
-    that name is missing. ``types`` are the vehicle's types, for rounding. The second result lists the converted
-    parameters.
+    ``known`` are the names of the vehicle's parameters, and ``types`` their types, for rounding. A parameter that the
+    vehicle has under no name keeps its name and value. If ``values`` has a parameter under several names, the value
+    under the vehicle's name is used. If that name is missing, the last value is used. The second result lists the
+    converted parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []
@@ -202,7 +202,7 @@ def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
 
 
 def _is_mask(value: float) -> bool:
-    # Another value cannot be converted to the opposite mask.
+    # Only a bit mask can be converted between ARMING_CHECK and ARMING_SKIPCHK.
     return -(2**31) <= value < 2**31 and value == int(value)
 
 

@@ -974,9 +974,9 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
     releases control, without waiting if the block exits by an error or cancellation. When another station takes
     control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing, and raises GimbalTaken, unless GimbalTaken
-    was raised in the block or :meth:`until_lost` has returned. Another station that uses your own system and component
-    id cannot be detected.
+    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken unless your program
+    already knows of the loss, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
+    system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -1173,7 +1173,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
                 then turns with the vehicle, so a yaw from north is correct only at the time of the order.
             frame: reference of the yaw. Afterwards the gimbal keeps its yaw from north (``"earth"``), or it turns with
-                the vehicle (``"vehicle"``, and after every mount command: see ``roll_deg`` and below).
+                the vehicle (``"vehicle"``). After a mount command (see below), it always turns with the vehicle.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
@@ -1471,9 +1471,9 @@ class Files(TwinOf["AsyncFiles"]):
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than the part. After such a resumed download, aerokit compares the CRC-32 of the copy with that of
-        the vehicle's file, if the vehicle can compute it; if they differ, the whole file is read again. Files whose
-        names begin with ``@`` are always read completely.
+        is shorter than the part. After a resumed download, aerokit compares the CRC-32 of both files, if the vehicle
+        can compute it. If they differ, the whole file is read again. Files whose names begin with ``@`` are always read
+        completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -1640,9 +1640,9 @@ class Logs(TwinOf["AsyncLogs"]):
     total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
     it. You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers LOG_* messages only while disarmed. When it is asked for a log by them, it ends the log that it is
-    writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current
-    end. If such a log is larger than its entry says, logger "aerokit" reports that (INFO).
+    ArduPilot answers LOG_* messages only while disarmed. When such a message requests a log, ArduPilot ends the log
+    that it is writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its
+    current end. If such a log is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def list(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
@@ -1941,7 +1941,7 @@ class Gripper(TwinOf["AsyncGripper"]):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
     Enable it by PD_GRIPPER_EN on PX4, by GRIP_ENABLE on ArduPilot. PX4 acknowledges when the gripper has moved.
-    ArduPilot acknowledges at once and reports the end by a status text; for an electro-permanent gripper it reports
+    ArduPilot acknowledges at once and reports the end by a status text. For an electro-permanent gripper, it reports
     only the start, and the call returns three seconds later. Orders are sent once. If you cancel a call, the gripper
     may still have moved.
     """
@@ -2168,8 +2168,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
-    the end.
+    while it reads more than five parameters. For names that are not known yet, it raises the rate after half a second.
+    It restores the rate at the end.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -2202,7 +2202,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         The metadata of PX4 contains the defaults.
 
         Raises:
-            FileFormatError: the file is damaged, or of another kind.
+            FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
         """
         return self.aio.load_metadata(path)
 
@@ -2331,14 +2331,16 @@ class Parameters(TwinOf["AsyncParameters"]):
         Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. Call
         ``download(refresh=True)`` first if another station may have set values that your program has not received.
 
-        ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
-        one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; a parameter that the vehicle does not have gets the outcome ``"failed"`` and a
-        ParameterRejected, and all other parameters are set. If two names mean the same parameter, the value under the
+        ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back. ``"set"`` sets them one by
+        one. ``"auto"`` uses the file if the vehicle supports it and there are many changes.
+
+        Results are as for :meth:`set_many`. A parameter that the vehicle does not have gets the outcome ``"failed"``
+        and a ParameterRejected; all others are set. If two names mean the same parameter, the value under the
         vehicle's current name is used, and the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
+            OSError: the file cannot be read. Nothing was set.
             ParameterTimeout: the vehicle's own parameters could not be downloaded.
         """
         return self._loop.run(
@@ -2546,9 +2548,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: send nothing if the vehicle already has this plan, and only the items that differ if the
-                vehicle supports that. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only
-                if ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
+            only_changes: send nothing if the vehicle already has this plan. If the vehicle supports it, send only the
+                items that differ. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only if
+                ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2648,15 +2650,15 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Args:
             item: number of the item.
-            timeout: seconds to wait until a running transfer has ended, and as many again until MISSION_CURRENT
-                confirms the item. Not used with MAV_CMD_DO_SET_MISSION_CURRENT.
+            timeout: only for MISSION_SET_CURRENT. Seconds to wait until a running transfer has ended, and as many again
+                until MISSION_CURRENT confirms the item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
             OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
-                fell silent before it was sent.
+                fell silent before the item was sent.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)
 
@@ -2697,15 +2699,15 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait, unless a pilot then changes to a mode other than that of
-        the mission. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An upload or
-        a download shows whether the mission ends with a landing. Without them, or after another station has replaced
-        the mission, the mode after the completion shows whether the vehicle lands.
+        A :meth:`pause` by another task does not end the wait. If a pilot then changes to another mode than that of the
+        mission, the wait ends. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An
+        upload or a download shows whether the mission ends with a landing. Without them, or after another station has
+        replaced the mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
-        items and the mission id (PX4 1.15 and later). If both stations share a link, it has also seen the vehicle's
-        answer to the other station. It does not notice a mission with the same number of items that ArduPilot has
-        received over another link or as a file: call :meth:`download` first if another station may replace missions.
+        items and the mission id (PX4 1.15 and later). On a shared link, the vehicle's answer to the other station also
+        shows it. aerokit does not notice a mission with the same number of items that ArduPilot has received over
+        another link or as a file. Call :meth:`download` first if another station may replace missions.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -2754,9 +2756,9 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: send nothing if the vehicle already has this plan, and only the items that differ if the
-                vehicle supports that. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only
-                if ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
+            only_changes: send nothing if the vehicle already has this plan. If the vehicle supports it, send only the
+                items that differ. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only if
+                ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2863,9 +2865,9 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: send nothing if the vehicle already has this plan, and only the items that differ if the
-                vehicle supports that. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only
-                if ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
+            only_changes: send nothing if the vehicle already has this plan. If the vehicle supports it, send only the
+                items that differ. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only if
+                ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -3515,7 +3517,8 @@ class Settings(TwinOf["AsyncSettings"]):
             locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
 
         Raises:
-            FileFormatError: the file is invalid, or has more than 16 MB. The previous definition stays.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition stays.
+            OSError: the file cannot be read.
         """
         return self._loop.call(self.aio.load, definition, locale=locale)
 
@@ -3540,7 +3543,7 @@ class Settings(TwinOf["AsyncSettings"]):
             NotSupported: the camera names no definition file.
             CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
-            FileFormatError: the file is invalid, or has more than 16 MB.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
             OperationRejected: the web server failed.
         """
@@ -3553,7 +3556,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return those options of a setting, as {name: value}, that the known values of other settings allow.
+        """Return the options of a setting that the known values of other settings allow, as {name: value}.
 
         Empty without a definition, and for settings without options.
         """
@@ -3609,15 +3612,15 @@ class Settings(TwinOf["AsyncSettings"]):
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        If the camera definition is loaded, ``value`` may be the name of an option. Settings that restrict this setting
-        are then read first if their values are unknown, and settings that it may change are read again afterwards.
+        If the camera definition is loaded, ``value`` may be the name of an option. Unknown settings that restrict this
+        setting are then read first. Settings that the camera may have changed are read again afterwards.
 
         Raises:
-            InvalidArgument: the name or value is invalid; or, by the definition, the value is not allowed, or the
-                setting is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid, or the definition does not allow this value now. Nothing was
+                set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is the PARAM_ACK in its answer.
-            ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that it may
-                change could not be read again.
+            ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that the
+                camera may have changed could not be read again.
         """
         return self._loop.run(self.aio.set, name, value, idle_timeout_s=idle_timeout_s, timeout=timeout)
 

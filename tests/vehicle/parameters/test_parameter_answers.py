@@ -29,6 +29,7 @@ INT, REAL = ParameterType.INT32, ParameterType.REAL32
         (INT, 1, 100, 50, "clamped"),
         (INT, 1, -7, 7, "clamped"),
         (INT, 1, 16_777_217, 16_777_216, "rounded"),
+        (INT, 16_777_216, 16_777_217, 16_777_216, "rounded"),
         (REAL, 1.0, 100.0, 100.1, "rounded"),
         (REAL, 1.0, -100.0, -100.05, "rounded"),
         (REAL, 1.0, 100.0, 100.2, "clamped"),
@@ -37,11 +38,13 @@ INT, REAL = ParameterType.INT32, ParameterType.REAL32
 )
 def test_write_outcomes(type_: ParameterType, before: float | None, wanted: float, answer: float, outcome: str) -> None:
     known = None if before is None else Parameter("P", before, type_)
-    assert outcome_of(Parameter("P", wanted, type_), known, Parameter("P", answer, type_)) == outcome
+    written, reported = Parameter("P", wanted, type_), Parameter("P", answer, type_)
+    assert outcome_of(written, known, reported, bytewise=False) == outcome
 
 
 def test_unchanged_value_is_a_refusal() -> None:
-    error = outcome_of(Parameter("P", 7, INT), Parameter("P", 1, INT), Parameter("P", 1, INT))
+    old = Parameter("P", 1, INT)
+    error = outcome_of(Parameter("P", 7, INT), old, old, bytewise=False)
     assert isinstance(error, ParameterRejected)
     assert str(error).startswith("P = 7 was refused: the vehicle keeps 1")
 
@@ -50,11 +53,13 @@ def test_unchanged_value_is_a_refusal() -> None:
     ("type_", "wanted", "kept", "text"),
     [
         (INT, 1234567, 1234568, "P = 1234567 was refused: the vehicle keeps 1234568"),
+        (INT, 16777217, 16777216, "P = 16777217 was refused: the vehicle keeps 16777216"),
         (REAL, 0.1, math.nan, "P = 0.1 was refused: the vehicle keeps nan"),
     ],
 )
 def test_refusal_shows_all_digits(type_: ParameterType, wanted: float, kept: float, text: str) -> None:
-    error = outcome_of(Parameter("P", wanted, type_), Parameter("P", kept, type_), Parameter("P", kept, type_))
+    old = Parameter("P", kept, type_)
+    error = outcome_of(Parameter("P", wanted, type_), old, old, bytewise=True)
     assert str(error) == text
 
 

@@ -315,7 +315,7 @@ async def test_transaction_write_of_other_task_does_not_outlive_it() -> None:
                 writes += [asyncio.create_task(transaction.set("WPNAV_SPEED", 700))]
                 await asyncio.gather(*writes)
         _, slow_write = writes
-        with pytest.raises(InvalidArgument, match="the block of these parameters has ended"):
+        with pytest.raises(InvalidArgument, match="block has ended; the remaining parameters were not set"):
             await slow_write
         assert flight.copter.parameters["WPNAV_SPEED"] == 1000.0
 

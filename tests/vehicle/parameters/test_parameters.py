@@ -429,8 +429,9 @@ async def test_set_clamped_rounded_and_refused() -> None:
         parameters = flight.vehicle.parameters
         clamped = await parameters.set("RTL_ALT", 9000)
         assert (clamped.outcome, clamped.value, clamped.requested) == ("clamped", 3000, 9000)
-        rounded = await parameters.set("LOG_BITMASK", 16_777_217)
-        assert (rounded.outcome, rounded.value) == ("rounded", 16_777_216)
+        for _ in range(2):
+            rounded = await parameters.set("LOG_BITMASK", 16_777_217)
+            assert (rounded.outcome, rounded.value) == ("rounded", 16_777_216)
         with pytest.raises(ParameterRejected, match="keeps 50"):
             await parameters.set("LAND_SPEED", 60)
     assert len(sent_writes(flight)) < 20

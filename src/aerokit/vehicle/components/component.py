@@ -51,9 +51,9 @@ class ComponentStatus(Snapshot):
     """One component of the vehicle's system.
 
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
-    MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. A camera or gimbal without a component id of its own
-    has a ``device_id`` from 1 to 6, and the ``component_id`` of the component to which it is attached; otherwise,
-    ``device_id`` is 0. ``received_at`` is the loop time of the component's last message.
+    MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. ``device_id`` is 1 to 6 for a camera or gimbal without
+    its own component id, otherwise 0. The ``component_id`` of such a device is that of the component to which it is
+    attached. ``received_at`` is the loop time of the component's last message.
     """
 
     component_id: int
@@ -274,7 +274,7 @@ class Component(ReadOnly):
                     except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
                         pass
                     except CommandRejected as error:
-                        # A refusal that may be that of an earlier request does not count before the last attempt.
+                        # If the refusal may belong to an earlier request, it counts only after the last attempt.
                         refusal = None if is_doubtful and attempts_left else error
                     # After the last request, wait until the time-out. After a refusal, return the message if it has
                     # already arrived, but do not wait for it.
@@ -358,7 +358,7 @@ async def _read_json(component: Component, uri: str) -> dict[str, Any]:
         raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
     try:
         data = decompress(await component.fetch(uri), uri)
-    except InvalidArgument as error:  # The component has reported the address.
+    except InvalidArgument as error:  # The component has given this address, not the caller.
         raise NotSupported(f"component {component.component_id}: {error}") from None
     try:
         content = json.loads(data.decode("utf-8-sig"))

@@ -103,7 +103,8 @@ class Settings:
             locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
 
         Raises:
-            FileFormatError: the file is invalid, or has more than 16 MB. The previous definition stays.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition stays.
+            OSError: the file cannot be read.
         """
         from aerokit.parameters import load_definition
 
@@ -135,7 +136,7 @@ class Settings:
             NotSupported: the camera names no definition file.
             CommandRejected, OperationTimeout: the camera did not send CAMERA_INFORMATION.
             InvalidArgument: the address has another scheme.
-            FileFormatError: the file is invalid, or has more than 16 MB.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
             OperationRejected: the web server failed.
         """
@@ -154,7 +155,7 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return those options of a setting, as {name: value}, that the known values of other settings allow.
+        """Return the options of a setting that the known values of other settings allow, as {name: value}.
 
         Empty without a definition, and for settings without options.
         """
@@ -232,15 +233,15 @@ class Settings:
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        If the camera definition is loaded, ``value`` may be the name of an option. Settings that restrict this setting
-        are then read first if their values are unknown, and settings that it may change are read again afterwards.
+        If the camera definition is loaded, ``value`` may be the name of an option. Unknown settings that restrict this
+        setting are then read first. Settings that the camera may have changed are read again afterwards.
 
         Raises:
-            InvalidArgument: the name or value is invalid; or, by the definition, the value is not allowed, or the
-                setting is read-only or excluded now. Nothing was set.
+            InvalidArgument: the name or value is invalid, or the definition does not allow this value now. Nothing was
+                set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is the PARAM_ACK in its answer.
-            ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that it may
-                change could not be read again.
+            ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that the
+                camera may have changed could not be read again.
         """
         check_name(name)
         with self._transfers.limit(timeout):

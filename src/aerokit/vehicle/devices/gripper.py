@@ -27,7 +27,7 @@ class Gripper(ReadOnly):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
     Enable it by PD_GRIPPER_EN on PX4, by GRIP_ENABLE on ArduPilot. PX4 acknowledges when the gripper has moved.
-    ArduPilot acknowledges at once and reports the end by a status text; for an electro-permanent gripper it reports
+    ArduPilot acknowledges at once and reports the end by a status text. For an electro-permanent gripper, it reports
     only the start, and the call returns three seconds later. Orders are sent once. If you cancel a call, the gripper
     may still have moved.
     """

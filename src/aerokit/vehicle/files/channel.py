@@ -161,9 +161,9 @@ class FileChannel:
                 reply = await self.transfers.run(request)
             except FileError as error:
                 if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
-                    # The file was requested more than once, and the reply to an earlier request may have been lost.
-                    # That request may then have opened the session that is now in use. PX4 has only one session, which
-                    # may also belong to another station; that station's transfer then opens its own file again.
+                    # The file was requested more than once. An earlier request may have opened the session that is now
+                    # in use, if its reply was lost. Close this session. PX4 has only one, which may also belong to
+                    # another station. That station must then open its file again.
                     may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
@@ -196,7 +196,7 @@ class FileChannel:
         )
 
     def _possible_sessions(self, request: FtpRequest) -> tuple[int, ...]:
-        """Return the ids of the session that an unanswered request may have opened."""
+        """Return the ids that the session of an unanswered request may have."""
         return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
@@ -209,7 +209,7 @@ class FileChannel:
 
     def _close_soon(self, session: int, path: str) -> None:
         """Close a session without waiting. The next operation waits for the confirmation."""
-        # The request is sent at once. The background task waits for the reply, and sends the request only to repeat it.
+        # The request is sent at once. The background task waits for the reply, and repeats the request if none arrives.
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
         with suppress(AerokitError):  # The connection may be closed.
             self.transfers.connection.send(request.message)
@@ -235,7 +235,7 @@ class LogChannel:
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._lock = asyncio.Lock()
-        # The task that waits until the end of the last failed operation is confirmed; None if no operation has failed.
+        # Task that waits until the vehicle confirms the end of the last failed operation; None if none has failed.
         self._ending: asyncio.Task[None] | None = None
 
     async def list(
@@ -302,7 +302,7 @@ class LogChannel:
     def _end(self) -> None:
         """Tell the vehicle to stop sending. The next operation waits for the confirmation."""
         transfers = self._transfers
-        # LOG_REQUEST_END is sent at once. The background task sends it only to repeat it.
+        # LOG_REQUEST_END is sent at once. The background task only repeats it.
         exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)
 
         async def confirm() -> None:

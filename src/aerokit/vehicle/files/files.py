@@ -101,9 +101,9 @@ class Files:
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than the part. After such a resumed download, aerokit compares the CRC-32 of the copy with that of
-        the vehicle's file, if the vehicle can compute it; if they differ, the whole file is read again. Files whose
-        names begin with ``@`` are always read completely.
+        is shorter than the part. After a resumed download, aerokit compares the CRC-32 of both files, if the vehicle
+        can compute it. If they differ, the whole file is read again. Files whose names begin with ``@`` are always read
+        completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.

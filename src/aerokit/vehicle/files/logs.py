@@ -92,9 +92,9 @@ class Logs:
     total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
     it. You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers LOG_* messages only while disarmed. When it is asked for a log by them, it ends the log that it is
-    writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current
-    end. If such a log is larger than its entry says, logger "aerokit" reports that (INFO).
+    ArduPilot answers LOG_* messages only while disarmed. When such a message requests a log, ArduPilot ends the log
+    that it is writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its
+    current end. If such a log is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def __init__(self, transfers: Transfers, files: Files, context: VehicleContext) -> None:
@@ -342,7 +342,7 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
 
 
 def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
-    """Return the entries in a newer list of the logs in ``logs``."""
+    """Return the entries of ``listed``, a newer list, whose logs are also in ``logs``."""
     # Logs are compared by time and size, because a new log may get the id of an erased one. Only the newest log may
     # have grown since, so it is found by its id.
     newest = logs[-1]

@@ -155,9 +155,9 @@ class GimbalControl:
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
     releases control, without waiting if the block exits by an error or cancellation. When another station takes
     control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing, and raises GimbalTaken, unless GimbalTaken
-    was raised in the block or :meth:`until_lost` has returned. Another station that uses your own system and component
-    id cannot be detected.
+    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken unless your program
+    already knows of the loss, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
+    system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.

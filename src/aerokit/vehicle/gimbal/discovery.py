@@ -42,8 +42,8 @@ class GimbalRegistry:
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
-        # Stands for the first gimbal until one is discovered. From then on, its state values follow those of the first
-        # gimbal. MOUNT_STATUS, which has no gimbal id, sets only these values.
+        # Stands for the first gimbal until one is discovered. Then it has the state values of the first gimbal.
+        # MOUNT_STATUS has no gimbal id, so it sets only the values of this placeholder.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
         # Requests of this program's `gimbal.control()` blocks that have not ended.
@@ -98,7 +98,7 @@ class GimbalRegistry:
         return min(matching, key=lambda device: (device.component_id != autopilot_id, device.key), default=None)
 
     def device(self, component_id: int, number: int) -> GimbalDevice | None:
-        """Return this gimbal, created if needed, or None if there are too many."""
+        """Return a gimbal, and create it if needed. Return None if there are ``MAX_GIMBALS`` others."""
         key = (component_id, number)
         device = self.devices.get(key)
         if device is None and len(self.devices) < MAX_GIMBALS:
@@ -191,7 +191,7 @@ class GimbalRegistry:
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
         else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
             device = self._device_of(message, device_id)
-            # The sender's status about one of its own gimbals proves as much as GIMBAL_MANAGER_INFORMATION does.
+            # The sender's status about one of its own gimbals counts like GIMBAL_MANAGER_INFORMATION.
             rank = max(rank, RANK_INFORMATION)
         if device is None:
             return None

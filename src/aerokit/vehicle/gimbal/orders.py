@@ -43,7 +43,7 @@ STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Orders to ``device``; if it is None, each order goes to the gimbal that is the first at that time.
+    """Orders to ``device``. If it is None, each order goes to the gimbal that is then the first.
 
     A new order ends the wait for the previous one.
     """

@@ -40,7 +40,7 @@ STILL_S, STILL_DEG = 0.4, 0.5
 
 
 class Angles(NamedTuple):
-    """Angles in degrees. None means: in an attitude, that the angle is unknown; in a target, that any is accepted."""
+    """Angles in degrees. In an attitude, None is an unknown angle. In a target, None accepts any angle."""
 
     pitch: float | None
     roll: float | None
@@ -144,7 +144,7 @@ async def wait_until_reached(
     session = orders.session
     deadline = session.connection.now() + timeout
     checked_at = since  # time of the last attitude that was checked
-    # `vehicle.gimbal` has one `public_device` for its state values, even while `attitude_source` and `device` change.
+    # Compare the reboots of `public_device`, because `attitude_source` and `device` may become other gimbals.
     reboots_before = orders.public_device.reboots
     watched = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
     with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:
@@ -274,7 +274,7 @@ class PointingMixin(GimbalMixin):
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
                 then turns with the vehicle, so a yaw from north is correct only at the time of the order.
             frame: reference of the yaw. Afterwards the gimbal keeps its yaw from north (``"earth"``), or it turns with
-                the vehicle (``"vehicle"``, and after every mount command: see ``roll_deg`` and below).
+                the vehicle (``"vehicle"``). After a mount command (see below), it always turns with the vehicle.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.

@@ -116,10 +116,10 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        """Stop the gimbal, unless a newer order was given or control was lost.
+        """Stop the gimbal, unless the stream has stopped already.
 
-        Raises an error with the reason in these two cases, and if the stream stopped earlier. If the program has
-        already got this error, or leaves the block by another error, nothing is raised.
+        If it has, for example because of a newer order or a loss of control, raise an error with the reason. Nothing is
+        raised if the program already got this error, or if another error leaves the block.
         """
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:

@@ -38,7 +38,7 @@ DUPLICATE_ACK_S = 1.0
 # If the same item is reported as reached again within this time, the message is a duplicate.
 DUPLICATE_WINDOW_S = 0.3
 
-# An item that becomes current again later than this many seconds after it was reached is approached again.
+# If an item becomes current more than this many seconds after it was reached, the vehicle flies to it again.
 SECOND_APPROACH_S = 1.0
 
 # After a landing, a vehicle may report another item than the last one for up to this many seconds, until it disarms.
@@ -121,7 +121,7 @@ class PlanContext:
     def version(self, mission_type: int) -> tuple[int, int]:
         """Return a value that changes whenever this program notices a change of the vehicle's plan."""
         cache = self.caches[mission_type]
-        # The number of transfers includes those of other stations on a shared link. The plan's id is 0 except on PX4.
+        # `changes` also counts the plans of other stations on a shared link. The plan's id is 0 except on PX4.
         return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
@@ -163,8 +163,8 @@ class PlanContext:
         hold_mode = self.autopilot.mode_for("hold", is_vtol=session.telemetry.is_vtol)
         holds = self.autopilot.holds_after_mission and self.tracker.is_in_mission_mode
         if event.system_id == session.system_id and holds and hold_mode is not None:
-            # The vehicle changes to this mode at the end of a mission. This is no takeover of an order that is given
-            # now.
+            # At the end of a mission, the vehicle changes to this mode by itself. An order that is given now must not
+            # take this for a takeover.
             self.vehicle_context.arbiter.expect_late(hold_mode)
 
 
@@ -192,8 +192,9 @@ class MissionTracker:
         self._reached_since_start: int | None = None
         # True if the last mission was flown to its end.
         self.is_complete: bool = False
-        # Time at which `reached` was reached, and time of the last report that the last item is the current one.
+        # Time at which `reached` was reached.
         self._reached_at = -math.inf
+        # Time of the last report that the last item is the current one.
         self._last_item_current_at = -math.inf
         # True if the vehicle flies to the item in `reached` once more.
         self._is_approached_again = False
@@ -238,7 +239,7 @@ class MissionTracker:
     def discard_completion(self) -> None:
         if not self._was_active:
             self.is_complete = False
-            # Reports of completion are about the previous flight until then.
+            # Reports of completion before this time are about the previous flight.
             self._stale_until = self._session.connection.now() + STALE_STATE_S
 
     def forget(self) -> None:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# Maps each last item that lands the vehicle to the purpose of the mode that the vehicle may use for this landing.
+# Maps commands that land the vehicle at the end of a mission to the purpose of the mode in which it may then land.
 LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: "return",
     MavCmd.NAV_LAND: "land",
@@ -57,7 +57,7 @@ class MissionEndDetector:
     item is reached. These missions end later:
 
     - If the last item is a landing, or a return with a landing, the vehicle must also be on the ground, because PX4
-      reports completion when the return starts. Disarming in the mode of the last item suffices without a report.
+      reports completion when the return starts. If it disarms in the mode of this item, no report is needed.
     - If the last item is a return without a landing, the vehicle must be at home.
     - If the items are unknown, the mode after the completion shows whether the vehicle still lands.
 
@@ -86,7 +86,7 @@ class MissionEndDetector:
             for command, purpose in LANDING_PURPOSES.items()
             if command == last_command or not self._is_last_item_landing_or_return
         ]
-        # Until this time, HEARTBEAT may not report the mission mode yet.
+        # Until this time, HEARTBEAT may still report the mode before the mission.
         self._mode_grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
@@ -96,7 +96,7 @@ class MissionEndDetector:
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
         # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
-        # On the ground, the end also requires a landing without a fall.
+        # On the ground, the mission has ended only if the vehicle has landed, and not fallen.
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
@@ -266,15 +266,15 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Args:
             item: number of the item.
-            timeout: seconds to wait until a running transfer has ended, and as many again until MISSION_CURRENT
-                confirms the item. Not used with MAV_CMD_DO_SET_MISSION_CURRENT.
+            timeout: only for MISSION_SET_CURRENT. Seconds to wait until a running transfer has ended, and as many again
+                until MISSION_CURRENT confirms the item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
             OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
-                fell silent before it was sent.
+                fell silent before the item was sent.
         """
         self._check_item(item)
         with self._vehicle_context.arbiter.auxiliary_order() as order:
@@ -335,7 +335,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             await vehicle_context.flight_cleanup.stop_in(mode, order)
         except (CommandRejected, OperationRejected):
-            # The vehicle does not hold. After other errors it may, so `_is_paused` then stays True.
+            # The vehicle does not hold. After other errors it may hold, so `_is_paused` stays True.
             if self._order is order:
                 self._is_paused = False
             raise
@@ -365,15 +365,15 @@ class MissionControl(VehiclePlan["Mission"]):
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait, unless a pilot then changes to a mode other than that of
-        the mission. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An upload or
-        a download shows whether the mission ends with a landing. Without them, or after another station has replaced
-        the mission, the mode after the completion shows whether the vehicle lands.
+        A :meth:`pause` by another task does not end the wait. If a pilot then changes to another mode than that of the
+        mission, the wait ends. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An
+        upload or a download shows whether the mission ends with a landing. Without them, or after another station has
+        replaced the mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
-        items and the mission id (PX4 1.15 and later). If both stations share a link, it has also seen the vehicle's
-        answer to the other station. It does not notice a mission with the same number of items that ArduPilot has
-        received over another link or as a file: call :meth:`download` first if another station may replace missions.
+        items and the mission id (PX4 1.15 and later). On a shared link, the vehicle's answer to the other station also
+        shows it. aerokit does not notice a mission with the same number of items that ArduPilot has received over
+        another link or as a file. Call :meth:`download` first if another station may replace missions.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -448,7 +448,7 @@ class MissionControl(VehiclePlan["Mission"]):
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
         """Set the current item.
 
-        Without ``keeps_jump_counts``, item 0 also resets ArduPilot's jump counts.
+        If ``keeps_jump_counts`` is False, setting item 0 also resets ArduPilot's jump counts.
         """
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)

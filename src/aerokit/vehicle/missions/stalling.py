@@ -33,10 +33,10 @@ _WAYPOINTS = (MavCmd.NAV_WAYPOINT, MavCmd.NAV_SPLINE_WAYPOINT)
 class MissionStallDetector:
     """Detects a fall, and a vehicle that does not move although its mission item requires movement.
 
-    A fall is a fast descent that is followed at once by 12 s of standstill, either on the ground, or at an item without
-    a hold. Without a fast descent, a standstill is reported after ``MISSION_STALL_TIMEOUT_S`` at an item without a
-    hold, while the vehicle is in its mission mode and not paused. The items are known only after an upload or a
-    download. A disarmed vehicle is never reported.
+    A fall is a fast descent that is followed at once by 12 s of standstill. The vehicle must be on the ground, or at an
+    item that requires movement. Without a fast descent, a standstill of ``MISSION_STALL_TIMEOUT_S`` is reported at such
+    an item. Items count only in the mission mode, and are known only after an upload or a download. A paused or
+    disarmed vehicle is never reported.
     """
 
     def __init__(
@@ -53,9 +53,9 @@ class MissionStallDetector:
         self._items = items or ()
         self._is_paused = is_paused
         self._stall = StallDetector(session)
-        # The item at which the vehicle had to move at the last call, and the time since which it has had to move. The
-        # item is None if the vehicle was allowed to stand still.
+        # The item at which the vehicle had to move at the last call; None if it was allowed to stand still.
         self._moving_item: int | None = None
+        # Time since which the vehicle has had to move at this item.
         self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:
@@ -67,8 +67,7 @@ class MissionStallDetector:
             return None
         should_move = self._should_move(current)
         standstill = self._stall()  # None unless the vehicle has stood still for 12 s
-        # After a fast descent, a standstill is a fall: on the ground at any item, in the air only at an item that
-        # requires movement.
+        # A standstill after a fast descent is a fall. In the air, this holds only at an item that requires movement.
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.

@@ -244,7 +244,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # Item 0 must be the vehicle's own home, because older firmware may take it as its new home.
+        if self._offset:  # Item 0 must be the vehicle's home, because older firmware may set its home to item 0.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
@@ -326,7 +326,7 @@ class PlanTransfer(Generic[PlanT]):
             if result.is_confirmed:
                 raise
             raise MissionRejected(
-                f"{self._name}: the vehicle refused the plan at about item {result.item}, and now has other items",
+                f"{self._name}: the vehicle refused the plan at about item {result.item}; its items differ",
                 result=MavMissionResult.ERROR,
                 item=result.item,
                 reasons=error.differences,
@@ -438,7 +438,7 @@ class PlanTransfer(Generic[PlanT]):
             raise self._mismatch(tuple(differences))
 
     def _mismatch(self, differences: tuple[str, ...]) -> VerificationFailed:
-        """Forget the vehicle's items, and return the error."""
+        """Forget the vehicle's items, and return the error for these differences."""
         self._cache.forget(self._context.now())
         message = f"{self._name}: the vehicle confirmed the plan, but has other items"
         return VerificationFailed(message, differences=differences)

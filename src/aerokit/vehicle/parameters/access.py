@@ -133,7 +133,7 @@ class ParameterAccess:
     def _ftp_probe(self) -> Iterator[None]:
         """Cancel the block and raise FileTimeout if no MAVFTP answer arrives soon."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
-        # Some relays drop only MAVFTP.
+        # Some relays drop only MAVFTP, so do not wait for the idle time-out.
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
         has_answer = False
 
@@ -339,7 +339,7 @@ class ParameterAccess:
                 self.store.mark_replaced(name, old_values[name])
             stored = self.store.get(name)
             if stored is not None and not same_value(stored.value, answer.value):
-                # Another value arrived after the answer, while other parameters were written. It may be a late one.
+                # Another value arrived after the answer. It may be a late answer, so the parameter is read again.
                 self._read_later(name, transfers.connection.now() + IN_FLIGHT_S)
         return answers
 

@@ -50,8 +50,8 @@ class Parameters(ReadOnly):
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters, or if there is no answer within half a second, and restores the rate at
-    the end.
+    while it reads more than five parameters. For names that are not known yet, it raises the rate after half a second.
+    It restores the rate at the end.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -95,7 +95,7 @@ class Parameters(ReadOnly):
         The metadata of PX4 contains the defaults.
 
         Raises:
-            FileFormatError: the file is damaged, or of another kind.
+            FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
         """
         from aerokit.parameters import load_metadata
 
@@ -223,14 +223,16 @@ class Parameters(ReadOnly):
         Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. Call
         ``download(refresh=True)`` first if another station may have set values that your program has not received.
 
-        ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
-        one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
-        :meth:`set_many`; a parameter that the vehicle does not have gets the outcome ``"failed"`` and a
-        ParameterRejected, and all other parameters are set. If two names mean the same parameter, the value under the
+        ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back. ``"set"`` sets them one by
+        one. ``"auto"`` uses the file if the vehicle supports it and there are many changes.
+
+        Results are as for :meth:`set_many`. A parameter that the vehicle does not have gets the outcome ``"failed"``
+        and a ParameterRejected; all others are set. If two names mean the same parameter, the value under the
         vehicle's current name is used, and the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
+            OSError: the file cannot be read. Nothing was set.
             ParameterTimeout: the vehicle's own parameters could not be downloaded.
         """
         with self._transfers.limit(timeout):

@@ -33,14 +33,14 @@ class ParameterStore:
 
     def __init__(self, transfers: Transfers, on_discarded: Callable[[str, float], None]) -> None:
         self._transfers = transfers
-        # Called after a message was ignored, with the parameter's name and the time after which its values count again.
+        # Called for each ignored message with the parameter's name and the time until which its old value is ignored.
         self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table; None until it is built again after a change.
         self._table: ParameterTable | None = ParameterTable()
         # True once the whole list has arrived since the vehicle started.
         self.is_complete: bool = False
-        # Number of values that have arrived in messages, and of reboots.
+        # Increased by each value that arrives in a message, and by each reboot.
         self.updates: int = 0
         self._forgotten_at = 0  # value of `updates` after the last reboot
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.

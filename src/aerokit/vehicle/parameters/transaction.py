@@ -76,14 +76,14 @@ class _Block:
         # The store may be outdated, so the vehicle's values are saved.
         answers = await self._access.read(unread_names, idle_timeout_s)
         if self._has_ended:  # A write by another task must not outlive the block, because nothing would restore it.
-            raise InvalidArgument("the block of these parameters has ended; the rest was not set")
+            raise InvalidArgument("the `async with` block has ended; the remaining parameters were not set")
         current: dict[str, Parameter] = {}
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # The store's value is used if it equals the answer up to rounding, because the answer may lack the last
-            # bits of a float. Otherwise the store is out of date: another station has just undone our write, and the
-            # store ignored the vehicle's message about it as a delayed one.
+            # The answer may lack the last bits of a float, so the store's value is used if both are equal up to
+            # rounding. Otherwise the store is out of date: another station has just undone our write, and the store
+            # took the vehicle's message about this for a late one.
             known = self._access.store.get(name) or answer
             current[name] = known if same_value(float(known.value), float(answer.value)) else answer
             if name not in self._saved:

@@ -97,7 +97,7 @@ class NameResolver:
         return translated
 
     def without_duplicates(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
-        """Drop each value that is also given under the vehicle's own name of the parameter."""
+        """Drop a value if ``values`` also has the parameter under the name that the vehicle uses."""
         from aerokit.parameters.renames import resolve_rename
 
         remaining = {}
@@ -197,18 +197,22 @@ def _failed_write(name: str, requested: float, known: Parameter | None, error: A
     return ParameterWrite(name, requested, value, type_, outcome="failed", error=error)
 
 
-def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
+def outcome_of(
+    sent: Parameter, old: Parameter | None, answer: ParameterAnswer, *, bytewise: bool
+) -> Outcome | AerokitError:
     if not isinstance(answer, Parameter):
         return answer
     is_old_value = old is not None and same_value(old.value, answer.value)
     if same_value(answer.value, sent.value):
         return "unchanged" if is_old_value else "set"
-    if is_old_value:  # This takes precedence over rounding, because PX4 transfers integers exactly.
+    # A 32-bit float cannot represent all integers. Those that are sent bytewise are exact.
+    is_rounded = to_float32(answer.value) == to_float32(sent.value)
+    if is_old_value and (bytewise or not is_rounded):
         kept = number_text(answer.value) if math.isfinite(answer.value) else answer.value
         text = f"{sent.name} = {number_text(sent.value)} was refused: the vehicle keeps {kept}"
         return ParameterRejected(text, name=sent.name)
-    if to_float32(answer.value) == to_float32(sent.value):
-        return "rounded"  # The requested value is an integer that a 32-bit float cannot represent exactly.
+    if is_rounded:
+        return "rounded"
     difference = abs(answer.value - sent.value)
     if answer.type.is_integer:
         is_near = difference < MAX_INTEGER_ROUNDING
@@ -259,7 +263,7 @@ class ParameterWriter:
     ) -> dict[str, ParameterWrite]:
         """Write the values, and return a result for each.
 
-        ``upload`` is the method of an upload, which sends only changed values. None sends all values by PARAM_SET.
+        With ``upload``, only changed values are sent, by this method. Otherwise, all values are sent by PARAM_SET.
         ``resolve`` is called instead of :meth:`NameResolver.resolve`.
         """
         resolve = resolve or self.names.resolve
@@ -303,7 +307,7 @@ class ParameterWriter:
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
         """Return the planned writes and the errors.
 
-        In the first round, an invalid value raises InvalidArgument.
+        ``is_first`` is True in the first round of writes. An invalid value then raises InvalidArgument.
         """
         plans: list[_PlannedWrite] = []
         first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
@@ -327,7 +331,7 @@ class ParameterWriter:
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
         name, requested = plan.resolved.requested, plan.requested
         answer = answers[plan.to_send.name]
-        outcome = outcome_of(plan.to_send, plan.old, answer)
+        outcome = outcome_of(plan.to_send, plan.old, answer, bytewise=self._access.store.bytewise)
         if isinstance(outcome, AerokitError):
             return _failed_write(name, requested, plan.resolved.as_requested(plan.old), outcome)
         assert isinstance(answer, Parameter)  # For all other answers, the outcome is an error.

@@ -27,7 +27,7 @@ UNSUPPORTED_RESULTS = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavRe
 MIN_ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
-"""An ack that has not arrived this many seconds after the call for its command ended is considered lost."""
+"""An ack is considered lost if it has not arrived this many seconds after the end of the call for its command."""
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""
@@ -61,8 +61,7 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # For each key, one entry for each ack of an earlier command that may still arrive: the time at which the entry
-        # was added.
+        # Acks of earlier commands that may still arrive: the time at which each of them was recorded.
         self._pending_acks: dict[_Key, list[float]] = {}
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
@@ -171,7 +170,7 @@ class CommandSender:
 
     def may_get_late_ack(self, command: int, component_id: int) -> bool:
         """Return True if an earlier transmission of this command may still be answered."""
-        # The late ack could be taken for the ack of the same command that is sent now, without retries.
+        # A command that is sent once would take such an ack for its own.
         earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return any(recorded_at >= earliest for recorded_at in self._pending_acks.get((component_id, command), ()))
 
@@ -215,8 +214,8 @@ class CommandSender:
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
-                # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command. If they have
-                # arrived while this call waited for the lock, the command is repeated, which is harmless: only commands
+                # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command. If they arrived
+                # while this call waited for the lock, the command is repeated. This is harmless, because only commands
                 # that stop or release something are sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
@@ -266,8 +265,8 @@ class CommandSender:
     def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
         """Record acks that may still arrive, so that the next command ignores them.
 
-        The last command may still get ``count`` acks. ``earlier_records`` are those of earlier commands, from
-        :meth:`_pop_pending_acks`.
+        ``count`` is the number of acks that the last command may still get. ``earlier_records`` are the times that
+        :meth:`_pop_pending_acks` has returned, without those of the acks that have arrived since.
         """
         new_records = [self._connection.now()] * count
         if earlier_records or new_records:

@@ -73,14 +73,14 @@ class _Stream:
         # The stream is requested again at `retry_at` if none of its messages has arrived by then.
         self.retry_interval_s = RETRY_INTERVAL_S
         self.retry_at = math.inf
-        # Number of consecutive requests without an ack, and the earliest time of the next request after them.
+        # Number of consecutive requests without an ack. The next request is not sent before `next_attempt_at`.
         self.failures = 0
         self.next_attempt_at = -math.inf
         self.detach: Detach | None = None
 
     @property
     def needed_hz(self) -> float:
-        """The highest rate needed that was not refused, or 0 (the autopilot's own rate)."""
+        """The highest needed rate that was not refused. If there is none, 0: the autopilot's own rate."""
         return max((hz for hz in self.requests.values() if hz not in self.refused_hz), default=AUTOPILOT_DEFAULT)
 
     @property
@@ -227,7 +227,7 @@ class MessageRates:
                 stream.message_type.ID,
                 interval_us,
                 component_id=self._component_id,
-                # With one attempt, a late refusal of another message would count as the answer to this request.
+                # A command that is sent once could take the late refusal of another message for its own.
                 attempts=2,
             )
         except CommandRejected as error:

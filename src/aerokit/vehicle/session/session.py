@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 # Seconds between requests for constants that are not known yet.
 RETRY_INTERVAL_S = 3.0
 
-# The modes are requested until one is received, or until this many requests were answered. An answer may belong to an
-# earlier request, because PX4 acknowledges a command over each of its ports.
+# The modes are requested until one is received, or until this many requests were answered. One answer is not enough:
+# it may belong to an earlier request, because PX4 acknowledges a command over each of its ports.
 MAX_MODE_REQUESTS = 3
 
 # Number of requests for the version that are sent at short intervals at first, and the interval in seconds.
@@ -71,7 +71,7 @@ EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
     """Request version, home, origin and modes while they are unknown.
 
-    Runs until the link closes, because a reboot makes them unknown. The modes are kept.
+    Runs until the link closes, because a reboot makes all of them but the modes unknown.
     """
     mode_requests_left = MAX_MODE_REQUESTS
     await _learn_version(commands, telemetry)
@@ -83,7 +83,6 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
         ):
             if not cell.is_known:
                 await _request(commands, message_id)
-        # The mode names are not requested again after a reboot, because they are kept.
         if mode_requests_left and not telemetry.has_available_modes:
             is_answered = await _request(commands, AvailableModes.ID)
             mode_requests_left -= is_answered
@@ -313,7 +312,7 @@ class VehicleSession:
 
     def with_reasons(self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()) -> CommandRejected:
         """Return the error with ``reasons`` and with the vehicle's status texts from ``since`` on."""
-        # An informational text such as "ArduPilot Ready" is no reason, unless it is a known refusal.
+        # Informational texts such as "ArduPilot Ready" are no reasons, but known refusals always are.
         texts = [
             text.text
             for text in self.telemetry.texts_since(since)

@@ -165,11 +165,10 @@ class ComponentSubscriber:
 class WatchedStream:
     """Requests the message of a state cell only while the program waits for the cell or iterates over its values.
 
-    The object is one of the feeds of the cell. ``request`` returns None if the message need not be requested now.
+    ``request`` returns None if the message need not be requested now. This `Feed` of the cell decodes nothing.
     """
 
     pending = False
-    """Part of the interface of feeds: this feed has no messages of its own to decode."""
 
     def __init__(self, cell: StateCell[Any], request: Callable[[], Detach | None]) -> None:
         self._cell, self._request = cell, request
@@ -177,7 +176,7 @@ class WatchedStream:
         self._release: Detach | None = None
 
     def catch_up(self) -> None:
-        """Do nothing, because another feed of the cell decodes the message."""
+        """Do nothing, because no message is ever pending here."""
 
     def watchers_changed(self) -> None:
         if not self._cell._is_watched and self._release is not None:

@@ -33,7 +33,7 @@ BACKGROUND_COMMAND_TIMEOUT_S = 5.0
 
 
 class Messaging(Protocol):
-    """Interface of the session of an autopilot or another component, as transfers need it."""
+    """Interface that transfers need from the session of an autopilot or another component."""
 
     on_reboot: list[Callable[[], None]]
 

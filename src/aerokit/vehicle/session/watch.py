@@ -65,9 +65,10 @@ class VehicleWatch:
         self._component_id = component_id
         self._now = connection.now
         self._on_reboot = on_reboot
-        # Times at which the last HEARTBEAT arrived, and at which it was processed.
-        # The vehicle may have been found by a HEARTBEAT that the connection has processed some time ago.
+        # Time at which the last HEARTBEAT arrived.
         self.last_heartbeat_at: float = heartbeat_at
+        # Time at which it was processed. The HEARTBEAT that found the vehicle may be old, but must not make the vehicle
+        # silent at once.
         self._heartbeat_read_at = max(self.last_heartbeat_at, connection.now() - SILENT_AFTER_S)
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
         self._state_tracker = LinkStateTracker(
@@ -85,7 +86,7 @@ class VehicleWatch:
         self._first_time: tuple[int, float] | None = None
         # By this clock, the connection recognises a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # Maps each clock to a decreased time and when it was processed. Later messages may confirm a reboot.
+        # Maps each clock to a time that has decreased, and when it was processed. Later messages may confirm it.
         self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
         # Our time when the last answer to a TIMESYNC request was processed, and the vehicle's time in it (ms).
@@ -230,8 +231,7 @@ class VehicleWatch:
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        # The times from before the reboot are discarded. Compared with them, later messages would show the same reboot
-        # again.
+        # Discard older times: later messages that are compared with them would show the same reboot again.
         self._last_times = {clock: (milliseconds, now)}
         self._decreased_times = {}
         self._first_time = None

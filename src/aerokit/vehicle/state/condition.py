@@ -162,8 +162,8 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
     """Return the flight mode in CURRENT_MODE, which reports a change earlier than HEARTBEAT but lacks ``base_mode``."""
-    # A custom_mode of 0 may be a mode, or mean that no mode is set, which only HEARTBEAT shows. The mode also depends
-    # on base_mode, which is unknown before the first HEARTBEAT.
+    # Only HEARTBEAT shows whether a custom_mode of 0 is a mode, or means that no mode is set. The mode also depends on
+    # base_mode, which is unknown before the first HEARTBEAT.
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)

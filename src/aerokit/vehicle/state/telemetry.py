@@ -39,9 +39,8 @@ class Telemetry(States):
     """All state cells of one vehicle, updated by its messages.
 
     It processes messages of component ``component_id`` (the autopilot) of system ``system_id``, and messages without a
-    frame, which the program itself has built. ``handles`` maps message ids to handlers of messages; ``streams`` maps
-    them to handlers of undecoded frames. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT shows
-    which autopilot this is.
+    frame, which the program itself has built. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT
+    shows which autopilot this is.
     """
 
     autopilot: Autopilot
@@ -251,7 +250,7 @@ class Telemetry(States):
         def update_with_context(message: Any, source: Source) -> None:
             context.before = cell.latest
             value = decode(message, context)
-            if value is not None:  # The value may combine messages of several types, so older ones count too.
+            if value is not None:  # Older messages are not dropped here, because the value may combine several types.
                 cell.set(value, source)
 
         chosen_update = update_with_context if message_source.needs_context else update
@@ -310,8 +309,8 @@ class Telemetry(States):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
-        # A text gets the time of its processing, because its time of arrival may be before that of the command whose
-        # refusal it explains.
+        # A text gets the time of its processing. After a pause of the event loop, its time of arrival may be before the
+        # command whose refusal it explains.
         joins_id_0 = self.autopilot.has_status_text_id_0
         self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=joins_id_0), source)
 
