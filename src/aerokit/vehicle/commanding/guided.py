@@ -213,13 +213,13 @@ class SetpointStream(SteeringStream[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
-    any way makes the vehicle hold.
+    any way, or a stop of the stream, orders the vehicle to hold. Exception: after a newer order, or a takeover by a
+    pilot or a failsafe, the stream sends nothing more.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
-    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
-    positions and trajectories only), or stays in place for twelve seconds although it should move. After such a stop,
-    ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode,
-    nothing more is sent to the vehicle.
+    ``max_lag_s``. It stops if the vehicle leaves the mode, disarms or falls silent. It also stops if the vehicle hits
+    the ground (velocities, positions and trajectories only), or stays in place for twelve seconds although it should
+    move. The next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
     """
 
     _NAME, _VALUE = "set-point stream", "set-point"
