@@ -632,7 +632,7 @@ class Guided(TwinOf["AsyncGuided"]):
         Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
 
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
-        set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
+        set-point. Without a new one for ``valid_for_s``, aerokit orders a hold.
         """
         return SetpointStream(
             self._loop,
@@ -3045,14 +3045,14 @@ class Camera(TwinOf["AsyncCamera"]):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
     ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
-    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. If the capabilities
-    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. State values are
-    polled only while your program uses them.
+    (usually 100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. aerokit
+    refuses a call, and sends nothing, if the camera has reported that it lacks the capability for the call. State
+    values are polled only while your program uses them.
     """
 
     @cached_property
     def mode(self) -> StateCell[str]:
-        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), polled every 5 s while you use it."""
+        """``"photo"``, ``"video"``, ``"survey"`` or ``"unknown"`` (CAMERA_SETTINGS); polled every 5 s while used."""
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
@@ -3458,7 +3458,7 @@ class Camera(TwinOf["AsyncCamera"]):
         return self._loop.run(self.aio.load_captures, timeout=timeout)
 
     def read_picture(self, capture: Capture) -> bytes:
-        """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
+        """Read the file of a picture by MAVFTP, at most 16 MB. Its ``file_url`` must begin with ``mftp://`` or ``/``.
 
         Raises:
             NotSupported: the capture has another URL, or none. No file was requested.

@@ -152,7 +152,7 @@ class Guided:
         Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
 
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
-        set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
+        set-point. Without a new one for ``valid_for_s``, aerokit orders a hold.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
 
