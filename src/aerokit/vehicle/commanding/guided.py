@@ -1,6 +1,6 @@
 """Guided set-points, streamed at a fixed rate while a program supplies them.
 
-An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). A library that
+An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 1 s). A library that
 resends the last set-point without limit defeats that protection. aerokit ends the stream and orders the vehicle to hold
 when the code that supplies set-points ends, raises, is cancelled, stops supplying them, or blocks the event loop, and
 when the vehicle falls silent.
