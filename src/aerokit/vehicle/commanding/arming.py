@@ -132,10 +132,10 @@ class ArmingActions(VehicleBase):
         might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
-        therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The end of the
-        vehicle's ``async with`` block ends this within 1.5 seconds. A vehicle that another party has armed stays armed.
-        aerokit assumes that this command has armed the vehicle if the vehicle accepts the command, or if HEARTBEAT
-        reports armed right after the command and no pilot has taken over. Logger "aerokit" warns about the outcome.
+        therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
+        ends with the vehicle's ``async with`` block. A vehicle that another party has armed stays armed. aerokit
+        assumes that this command has armed the vehicle if the vehicle accepts the command, or if HEARTBEAT reports
+        armed right after the command and no pilot has taken over. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
