@@ -125,7 +125,7 @@ PARAMS_WITHOUT_NAN: dict[int, tuple[int, ...]] = {
     MavCmd.NAV_SCRIPT_TIME: (1, 2),
 }
 
-# The suffix has no meaning in MISSION_ITEM_INT.
+# The suffix _INT of a frame has no meaning in MISSION_ITEM_INT.
 _FRAME_ALIASES: dict[int, int] = {
     MavFrame.GLOBAL_INT: MavFrame.GLOBAL,
     MavFrame.GLOBAL_RELATIVE_ALT_INT: MavFrame.GLOBAL_RELATIVE_ALT,

@@ -592,7 +592,7 @@ def rally_point(
 def _place_or_altitude(
     latitude_deg: Position | Home | float | None, longitude_deg: float | None, altitudes: Altitudes
 ) -> tuple[Position | Home | float | None, float | None, Altitudes]:
-    """Take a single number for an altitude above home."""
+    """Treat a number without a longitude as an altitude above home."""
     if isinstance(latitude_deg, (int, float)) and longitude_deg is None and altitudes == (None, None, None):
         return None, None, (latitude_deg, None, None)
     return latitude_deg, longitude_deg, altitudes

@@ -85,8 +85,8 @@ def format_plan(plan: Plan | Mission) -> str:
     If the plan was read from a file, all values of that file that have not changed are kept, also unknown fields.
 
     Raises:
-        InvalidArgument: ``plan`` is neither a plan nor a mission, or a .plan file cannot store a value: rally points
-            or a fence return point with altitudes that are not relative to home, or infinite numbers.
+        InvalidArgument: ``plan`` is neither a plan nor a mission, or it has a value that a .plan file cannot store: an
+            infinite number, or a rally point or fence return point whose altitude is not relative to home.
     """
     if isinstance(plan, Mission):
         plan = Plan(plan)

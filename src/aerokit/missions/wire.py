@@ -166,7 +166,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
-            # In ArduPilot, 0°, 0° means the current position: that of the last destination before it.
+            # In ArduPilot, 0°, 0° means the current position, which is the last destination before this item.
             if current_xy is not None and item.x == item.y == 0:
                 x, y = current_xy
                 item = item.replace(x=x, y=y)
@@ -212,8 +212,8 @@ def pack_items(
 ) -> bytes:
     """Encode items (with the vehicle's numbering) as a packed plan.
 
-    ArduPilot processes a file when it is closed. A whole plan has ``first`` 0 and no options: ArduPilot first clears
-    the old mission. If it then refuses an item, the new mission consists of the items before that item.
+    ArduPilot processes a file when it is closed. A whole plan has ``first`` 0 and no options. ArduPilot then clears the
+    old mission first. If it refuses an item, the new mission consists of the items before that item.
 
     With the option :data:`NO_CLEAR`, which ArduPilot accepts only for missions, the file replaces or appends items from
     index ``first`` on, and all other items are kept. In such a file, jump targets must be below the number of items in

@@ -471,13 +471,13 @@ class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
-    any way makes the vehicle hold.
+    any way, or a stop of the stream, orders the vehicle to hold. Exception: after a newer order, or a takeover by a
+    pilot or a failsafe, the stream sends nothing more.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
-    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
-    positions and trajectories only), or stays in place for twelve seconds although it should move. After such a stop,
-    ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode,
-    nothing more is sent to the vehicle.
+    ``max_lag_s``. It stops if the vehicle leaves the mode, disarms or falls silent. It also stops if the vehicle hits
+    the ground (velocities, positions and trajectories only), or stays in place for twelve seconds although it should
+    move. The next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
     """
 
     @property
@@ -632,7 +632,7 @@ class Guided(TwinOf["AsyncGuided"]):
         Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
 
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
-        set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
+        set-point. Without a new one for ``valid_for_s``, aerokit orders a hold.
         """
         return SetpointStream(
             self._loop,
@@ -690,13 +690,13 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving the block, also by an exception, makes the vehicle hold.
+    OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. Exception: after a newer
+    order, or a takeover by a pilot or a failsafe, the stream sends nothing more.
 
-    The stream stops by itself, and the vehicle holds, for the same reasons as a set-point stream, and also when no new
-    position of the target arrives for ``valid_for_s``, when the source of positions ends or raises, or when the target
-    is farther away than ``max_distance_m``. If a pilot or a failsafe changes the mode, the stream stops, and nothing
-    more is sent, not even an order to hold. After a stop, ``fly`` and leaving the block raise
-    :class:`SetpointStreamStopped`.
+    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but the vehicle may stay in place. It
+    also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or raises,
+    or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or else the
+    end of the block, raises :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.
@@ -734,16 +734,16 @@ class StickStream(BlockTwin["AsyncStickStream"]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
     Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block, also
-    by an exception, orders the vehicle to hold and ends the stream; ArduPilot is also told to release the sticks. If
-    the stream stops by itself (no new positions, a blocked event loop, a silent vehicle, another mode), ``set`` and
-    leaving the block raise :class:`SetpointStreamStopped`. No hold is ordered if it stopped because a pilot or a
-    failsafe changed the mode.
+    by an exception, orders the vehicle to hold, except after a newer order or a takeover. ArduPilot is also told to
+    release the sticks. If the stream stops by itself (no new positions, a blocked event loop, a silent vehicle,
+    another mode), the next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
 
-    If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
-    sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
-    stream as a loss of the sticks. Without another source of manual control, PX4 then executes NAV_RCL_ACT (return by
-    default). PX4 does so even in hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
-    executes the action of FS_THR_ENABLE after the end of a stream.
+    If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s). ArduCopter without a
+    transmitter executes the action of FS_THR_ENABLE after every end of a stream.
+
+    PX4 has no message that releases the sticks. COM_RC_LOSS_T (0.5 s) after every end of a stream, it treats the sticks
+    as lost. Without another source of manual control, it then executes NAV_RCL_ACT (return by default), even in hold
+    mode unless bit 1 of COM_RCL_EXCEPT is set.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
@@ -2505,7 +2505,7 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
         Two steps need a confirmation: one after all sticks and switches were moved to their ends, one after the sticks
-        were centered.
+        were centered, with the throttle at its lowest.
         """
         return Calibration(self._loop, self._loop.call(self.aio.radio))
 
@@ -3047,14 +3047,14 @@ class Camera(TwinOf["AsyncCamera"]):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
     ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
-    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. If the capabilities
-    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. State values are
-    polled only while your program uses them.
+    (usually 100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. aerokit
+    refuses a call, and sends nothing, if the camera has reported that it lacks the capability for the call. State
+    values are polled only while your program uses them.
     """
 
     @cached_property
     def mode(self) -> StateCell[str]:
-        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), polled every 5 s while you use it."""
+        """``"photo"``, ``"video"``, ``"survey"`` or ``"unknown"`` (CAMERA_SETTINGS); polled every 5 s while used."""
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
@@ -3460,7 +3460,7 @@ class Camera(TwinOf["AsyncCamera"]):
         return self._loop.run(self.aio.load_captures, timeout=timeout)
 
     def read_picture(self, capture: Capture) -> bytes:
-        """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
+        """Read the file of a picture by MAVFTP, at most 16 MB. Its ``file_url`` must begin with ``mftp://`` or ``/``.
 
         Raises:
             NotSupported: the capture has another URL, or none. No file was requested.
@@ -4223,7 +4223,7 @@ class Vehicle(VehicleTwin):
         or their effect is reported. The retries also end in these cases:
 
         - A newer order is given whose subjects include the first subject of this order.
-        - The mode changes to one that this program has not ordered, by this order or in the ten seconds before it. An
+        - The mode changes, and neither this order nor any order of the ten seconds before it asked for the new mode. An
           order to disarm is still retried.
         - A failsafe becomes active. An order to land, to return or to disarm is still retried.
         - The vehicle reboots or, if the first subject is ``"motion"``, disarms.
@@ -4337,7 +4337,7 @@ class Vehicle(VehicleTwin):
     def describe_now(self) -> str:
         """Return a text about the reported state.
 
-        For example: ``holding in BRAKE, still armed, 9 m above home, last heartbeat 0.3 s ago``.
+        For example: ``holding in BRAKE, still armed, 9.0 m above home, last heartbeat 0.3 s ago``.
         """
         return self.aio.describe_now()
 
@@ -4449,8 +4449,8 @@ class Vehicle(VehicleTwin):
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        This is so if the program armed the vehicle, or has given a steering order since another party armed it; and if
-        no pilot, failsafe or other program has taken over since. False for a vehicle that the program only observes.
+        The program must have armed the vehicle, or have given a steering order since another party armed it. No pilot,
+        failsafe or other program may have taken over since. False for a vehicle that the program only observes.
         """
         return self.aio.is_flown_by_program
 
@@ -4492,9 +4492,9 @@ class Vehicle(VehicleTwin):
         :meth:`why_not_armable` reports a mode that does not allow arming.
 
         Raises:
-            OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts. A mode that does not allow arming is named after this list. Three seconds before this error, a
-                vehicle whose pre-arm checks fail is asked for its reasons.
+            OperationTimeout: not ready within ``timeout`` seconds. The text lists what is missing, recent status texts
+                and, at its end, a mode that does not allow arming. Three seconds before this error, a vehicle whose
+                pre-arm checks fail is asked for its reasons.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 
@@ -4510,15 +4510,15 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If it refuses there, the mode is changed
-        and the command is sent a second time. Otherwise the command is sent only once, because a repetition might arm a
-        vehicle that a pilot has just disarmed.
+        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If ArduCopter refuses in AUTO, the mode is
+        changed and the command is sent a second time. Otherwise the command is sent only once, because a repetition
+        might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
-        therefore monitors the vehicle for 15 seconds, as long as the connection is open, and disarms it if this command
-        arms it after all. A vehicle that another party has armed stays armed. aerokit assumes that this command has
-        armed the vehicle if the vehicle accepts the command, or if HEARTBEAT reports armed right after the command and
-        no pilot has taken over. Logger "aerokit" warns about the outcome.
+        therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
+        ends with the vehicle's ``async with`` block. A vehicle that another party has armed stays armed. aerokit
+        assumes that this command has armed the vehicle if the vehicle accepts the command, or if HEARTBEAT reports
+        armed right after the command and no pilot has taken over. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
@@ -4883,15 +4883,16 @@ class Vehicle(VehicleTwin):
         """Fly to a place and return on arrival.
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
-        order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
-        heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
+        order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
+        next heartbeat. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support this command.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, only the
-                altitude above home is used. Home is always this vehicle's home, also for the position of another
-                vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the present altitude is kept.
+                altitude above home is used, and it counts from the home of this vehicle. A position of another vehicle
+                may count from another home. Without an altitude, or if the target is ``vehicle.home.value``, the
+                present altitude is kept.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -4947,12 +4948,12 @@ class Vehicle(VehicleTwin):
         """Turn on the spot and return when the vehicle has this heading.
 
         An ArduPilot vehicle changes to GUIDED and gets MAV_CMD_CONDITION_YAW. PX4 does not support this command, so the
-        vehicle stops and turns by MAV_CMD_DO_REPOSITION.
+        vehicle stops and turns by MAV_CMD_DO_REPOSITION. After a cancellation, the vehicle continues to turn.
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left. The vehicle turns the shorter way to the new heading, but ArduPilot turns by a relative angle of
-                170 to 350 degrees in the direction of its sign.
+                left. The vehicle turns the shorter way. Exception: for a relative angle of 170 to 350 degrees,
+                ArduPilot turns right if the angle is positive, and left if it is negative.
             relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.

@@ -183,7 +183,7 @@ async def test_land_on_newer_order_before_first_sight_stands() -> None:
         going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(east_m=200)))
         await anyio.sleep(1)
         sees.set()
-        with pytest.raises(OperationRejected, match="another order was given before anything was ordered"):
+        with pytest.raises(OperationRejected, match="another order was given meanwhile; this order was not sent"):
             await landing
         assert not [each for each in flight.wire.mode_orders() if each == CopterMode.LAND]
         going.cancel()

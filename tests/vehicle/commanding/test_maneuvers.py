@@ -564,6 +564,16 @@ async def test_autotune_ignores_unknown_progress() -> None:
         assert seen == [0, 20, 40, 60, 80, 95]
 
 
+async def test_autotune_timeout_without_progress_names_no_percentage() -> None:
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    async with hovering(simulated) as (vehicle, _):
+        simulated.faults.ignore(MavCmd.DO_AUTOTUNE_ENABLE, times=1)
+        ack = m.CommandAck(MavCmd.DO_AUTOTUNE_ENABLE, MavResult.IN_PROGRESS, 255, 0, 0, 0)
+        asyncio.get_running_loop().call_later(0.2, simulated.send, ack)
+        with pytest.raises(OperationTimeout, match=r"within 0\.5 s \(progress unknown\)"):
+            await vehicle.autotune(timeout=0.5)
+
+
 async def test_autotune_ignores_ack_of_another_component() -> None:
     simulated = SimulatedPx4(boot_time_s=0.0)
     async with hovering(simulated) as (vehicle, _):

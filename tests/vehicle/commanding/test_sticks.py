@@ -142,7 +142,7 @@ async def test_pilot_while_parameters_are_read_keeps_vehicle() -> None:
         flight.copter.faults.drop_incoming = 6
         flight.wire.clear()
         flight.pilot_takes_over(CopterMode.ALT_HOLD)
-        with pytest.raises(OperationRejected, match="from GUIDED to ALT_HOLD before anything was ordered"):
+        with pytest.raises(OperationRejected, match="from GUIDED to ALT_HOLD; the order was not sent"):
             async with flight.vehicle.sticks():
                 raise AssertionError("entered")
         assert not flight.wire.mode_orders()

@@ -226,7 +226,7 @@ async def test_pilot_before_first_sight_keeps_vehicle() -> None:
         see = camera(simulated.motion, blind=lambda: flight.vehicle.mode_name == "GUIDED")
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(take_over_after, flight, 3.0)
-            with pytest.raises(OperationRejected, match="from GUIDED to LOITER before anything was ordered"):
+            with pytest.raises(OperationRejected, match="from GUIDED to LOITER; the order was not sent"):
                 await flight.vehicle.land_on(see)
         assert not flight.wire.mode_orders()
 

@@ -161,7 +161,7 @@ class CalibrationControl:
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
         Two steps need a confirmation: one after all sticks and switches were moved to their ends, one after the sticks
-        were centered.
+        were centered, with the throttle at its lowest.
         """
         return self._prepare("radio", procedures.radio_by_channels, px4=procedures.radio_by_channels)
 
@@ -191,8 +191,8 @@ class CalibrationControl:
     ) -> Calibration:
         """Return the iterator of a calibration. Nothing is sent before its first step.
 
-        The parameter of MAV_CMD_PREFLIGHT_CALIBRATION with the number ``command_param`` is ``param_value``. All
-        parameters before it are 0. If ``command_param`` is 0, the procedure gets no parameters.
+        Parameter number ``command_param`` of MAV_CMD_PREFLIGHT_CALIBRATION is ``param_value``. The parameters before it
+        are 0. If ``command_param`` is 0, the procedure gets no parameters.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"

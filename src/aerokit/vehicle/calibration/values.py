@@ -53,7 +53,7 @@ class CalibrationStep(Snapshot):
         progress: 0 to 1; None if the vehicle reports none.
         instruction: what to do now.
         pose: the pose to take now; None if no pose is needed.
-        remaining: the poses that are still needed, including ``pose``; their order does not matter.
+        remaining: the poses that are still needed, including ``pose``; PX4 accepts them in any order.
         needs_confirmation: the calibration waits until your program continues its loop, which confirms that the
             instruction was followed.
         result: the result of the calibration in the last step; None in all others.

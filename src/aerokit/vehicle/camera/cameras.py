@@ -37,9 +37,9 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
     ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any other. A camera has its own component id
-    (100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. If the capabilities
-    that the camera has reported exclude a call, aerokit refuses the call before anything is sent. State values are
-    polled only while your program uses them.
+    (usually 100 to 105), or is attached to the autopilot (1 to 6) by ArduPilot's drivers or PX4's trigger. aerokit
+    refuses a call, and sends nothing, if the camera has reported that it lacks the capability for the call. State
+    values are polled only while your program uses them.
     """
 
     def __init__(self, link: CameraLink) -> None:
@@ -156,7 +156,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         raise self._link.timeout_error(f"did not report {not_reported} within {timeout:g} s")
 
     async def read_picture(self, capture: Capture) -> bytes:
-        """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
+        """Read the file of a picture by MAVFTP, at most 16 MB. Its ``file_url`` must begin with ``mftp://`` or ``/``.
 
         Raises:
             NotSupported: the capture has another URL, or none. No file was requested.

@@ -241,9 +241,8 @@ class CaptureLog:
             # A CAMERA_CAPTURE_STATUS that was sent before this picture does not include it. This time stamp makes
             # `_on_status` ignore such a status.
             self._count_boot_ms = message.time_boot_ms
-        # Indices begin at 0, so `index` pictures were taken before this one; the camera may count this one later. An
-        # index far above the count shows that the camera does not count as the standard says. The count is then left
-        # unchanged.
+        # Indices begin at 0, so `index` pictures came before this one. The camera may not have counted this one yet. If
+        # the index is far above the count, the camera does not count as the standard says.
         if self._has_nonzero_count and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)

@@ -57,7 +57,7 @@ class _ResendGuard:
 
 
 class CameraOrders:
-    """Base class of `CameraLink`: sends commands to one camera, and withdraws them when a newer order replaces them."""
+    """Base class of `CameraLink`: sends commands to one camera. A newer order ends the retries of an earlier one."""
 
     _context: VehicleContext
     _session: VehicleSession
@@ -345,7 +345,7 @@ class MessageRequests:
         return None
 
     def poll_for(self, cell: StateCell[Any], message_type: type[Message], period_s: float) -> None:
-        """Request the message that sets ``cell`` every ``period_s`` seconds while the program uses the cell."""
+        """Every ``period_s`` seconds, request the message that sets ``cell``, while the program uses the cell."""
         self._polled.append(_PolledCell(self._link.now, cell, message_type, period_s))
 
     def forget_refusals(self) -> None:

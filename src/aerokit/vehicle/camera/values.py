@@ -93,8 +93,8 @@ class CameraStatus(Snapshot):
 class CameraStorage(Snapshot):
     """One storage medium of a camera (STORAGE_INFORMATION).
 
-    ``status`` is ``"ready"``, ``"empty"`` (no medium), ``"unformatted"`` or ``"not_supported"``. Sizes are in MiB, None
-    unless the medium is ready; speeds in MiB/s, None if unknown. ``kind`` is ``"sd"``, ``"microsd"`` …
+    ``status`` is ``"ready"``, ``"empty"`` (no medium), ``"unformatted"``, ``"not_supported"`` or ``"unknown"``. Sizes
+    are in MiB, None unless the medium is ready; speeds in MiB/s, None if unknown. ``kind`` is ``"sd"``, ``"microsd"`` …
     """
 
     number: int
@@ -113,9 +113,9 @@ class CameraStream(Snapshot):
     """One video stream of a camera (VIDEO_STREAM_INFORMATION, VIDEO_STREAM_STATUS).
 
     ``number`` counts from 1. ``uri`` is the stream's address, or for RTP over UDP the port to listen on. ``kind`` is
-    ``"rtsp"``, ``"rtpudp"``, ``"tcp_mpeg"``, ``"mpeg_ts"`` or ``"whep"``; ``encoding`` is ``"h264"``, ``"h265"`` or
-    ``"unknown"``. ``bitrate`` is in bits per second, ``rotation_deg`` is clockwise, and ``horizontal_fov_deg`` is None
-    if unknown.
+    ``"rtsp"``, ``"rtpudp"``, ``"tcp_mpeg"``, ``"mpeg_ts"``, ``"whep"`` or ``"unknown"``. ``encoding`` is ``"h264"``,
+    ``"h265"`` or ``"unknown"``. ``bitrate`` is in bits per second, ``rotation_deg`` is clockwise, and
+    ``horizontal_fov_deg`` is None if unknown.
     """
 
     number: int
@@ -138,8 +138,9 @@ class CameraStream(Snapshot):
 class TrackingStatus(Snapshot):
     """Tracking in the image (CAMERA_TRACKING_IMAGE_STATUS); coordinates are 0 to 1 from the left and the top.
 
-    ``mode`` is ``"none"``, ``"point"`` or ``"rectangle"``. ``point`` is (x, y), ``radius`` is a fraction of the image
-    width, and ``rectangle`` is (left, top, right, bottom). ``has_failed`` is True if the tracked object was lost.
+    ``mode`` is ``"none"``, ``"point"``, ``"rectangle"`` or ``"unknown"``. ``point`` is (x, y), ``radius`` is a fraction
+    of the image width, and ``rectangle`` is (left, top, right, bottom). ``has_failed`` is True if the tracked object
+    was lost.
     """
 
     is_active: bool

@@ -38,7 +38,7 @@ def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
 
     ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed.
     """
-    # If HEARTBEAT reported disarmed later than that, the order had no effect, and another party has armed the vehicle.
+    # If HEARTBEAT reported disarmed after this delay, the order had no effect, and another party has armed the vehicle.
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
@@ -71,8 +71,8 @@ class CommandArbiter:
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
-        # See `late_modes`: (time, mode) of each order that was replaced, or whose block was left, before HEARTBEAT
-        # reported its mode, and of the end of a mission.
+        # (time, mode) of modes that HEARTBEAT may still report: those of orders that were replaced or whose block was
+        # left, and of the end of a mission.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
@@ -109,7 +109,7 @@ class CommandArbiter:
     def supersede(self, topics: Iterable[Topic]) -> None:
         topics = tuple(topics)
         self._ordered_since_disarmed.update(topics)
-        # This order has no rules of its own: it is registered only to be newer than the posted ones.
+        # This order is never sent. It only ends the posted orders about these topics, because it is newer.
         self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
@@ -201,8 +201,9 @@ class CommandArbiter:
     ) -> Iterator[Order]:
         """Create a posted order, which is valid during the `with` block.
 
-        The order ends earlier posted orders whose first subject is in ``subjects``. A newer order about its own first
-        subject ends it. If this subject is "mode" or "motion", the order also ends the action in progress.
+        The new order ends earlier posted orders whose first subject is in ``subjects``. A later order about the first
+        of ``subjects`` ends the new order. If the first is "mode" or "motion", the new order also ends the action in
+        progress.
         """
         first_subject = subjects[0]
         is_steering = first_subject != "arm"
@@ -323,8 +324,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        # After an order without modes, such as a raw command, a mode change does not prove a takeover. If a posted
-        # order has followed, `order` is not the newest one, and its end says nothing.
+        # After an order without modes, such as a raw command, a mode change does not prove a takeover. If `order` is
+        # not the newest one, the vehicle may execute a posted order that followed.
         was_taken_over = order is not None and bool(order.modes) and bool(order.takeover_reason) and order.is_newest
         # Disarming clears `topics`. A takeover does not undo an order to arm.
         return "arm" in topics if was_taken_over else bool(topics)

@@ -80,9 +80,9 @@ class ArmingActions(VehicleBase):
         :meth:`why_not_armable` reports a mode that does not allow arming.
 
         Raises:
-            OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts. A mode that does not allow arming is named after this list. Three seconds before this error, a
-                vehicle whose pre-arm checks fail is asked for its reasons.
+            OperationTimeout: not ready within ``timeout`` seconds. The text lists what is missing, recent status texts
+                and, at its end, a mode that does not allow arming. Three seconds before this error, a vehicle whose
+                pre-arm checks fail is asked for its reasons.
         """
         telemetry = self.telemetry
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home, telemetry.armed)
@@ -127,15 +127,15 @@ class ArmingActions(VehicleBase):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If it refuses there, the mode is changed
-        and the command is sent a second time. Otherwise the command is sent only once, because a repetition might arm a
-        vehicle that a pilot has just disarmed.
+        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If ArduCopter refuses in AUTO, the mode is
+        changed and the command is sent a second time. Otherwise the command is sent only once, because a repetition
+        might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
-        therefore monitors the vehicle for 15 seconds, as long as the connection is open, and disarms it if this command
-        arms it after all. A vehicle that another party has armed stays armed. aerokit assumes that this command has
-        armed the vehicle if the vehicle accepts the command, or if HEARTBEAT reports armed right after the command and
-        no pilot has taken over. Logger "aerokit" warns about the outcome.
+        therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
+        ends with the vehicle's ``async with`` block. A vehicle that another party has armed stays armed. aerokit
+        assumes that this command has armed the vehicle if the vehicle accepts the command, or if HEARTBEAT reports
+        armed right after the command and no pilot has taken over. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
@@ -387,7 +387,7 @@ class ArmingActions(VehicleBase):
             now = self.connection.now()
             if now >= next_request_at:
                 self._session.link_watch.request_time()
-                # The requests are frequent at first, because the clock of a fast simulation soon exceeds the time since
-                # boot before the reboot.
+                # A reboot shows only while the time since boot is shorter than before. In a fast simulation, that is
+                # not for long, so the requests are frequent at first.
                 next_request_at = now + POLL_INTERVAL_S + (now - started) / 10
             await anyio.sleep(POLL_INTERVAL_S)

@@ -110,7 +110,7 @@ STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(ma
 class FlightCleanup:
     """Makes the vehicle hold when the program orders a hold, or after an order was abandoned.
 
-    ``stop_stream(reason)`` stops the active set-point stream; None while there is no such stream.
+    ``stop_stream(reason)`` stops the active set-point stream. ``stop_stream`` is None while there is no such stream.
     """
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
@@ -163,9 +163,10 @@ class FlightCleanup:
             return False
         session = self._session
         mode = session.autopilot.mode_for("hold", is_vtol=session.telemetry.is_vtol)
-        if mode is None or session.end.error is not None:  # A hold cannot be sent, or another vehicle object may fly.
+        # After the end of this session, the program may fly the vehicle by another `Vehicle` object.
+        if mode is None or session.end.error is not None:
             return False
-        if session.telemetry.is_confirmed_disarmed or order.end:  # A hold must not be sent.
+        if session.telemetry.is_confirmed_disarmed or order.end:
             return False
         # If `stop_in` was abandoned, its command was probably sent, and must not be repeated without a HEARTBEAT.
         can_send_now = self._arbiter.is_state_recent and not order.only_stops
@@ -236,12 +237,12 @@ class FlightCleanup:
 
     @contextmanager
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
-        """Create an order to change to ``mode``, for a caller that must prepare a stream before it sends the order.
+        """Create an order to change to ``mode``. The caller prepares a stream in the block, and then sends the order.
 
-        The caller prepares the stream in the `with` block, and sends the order after it. If the block fails, the order
-        is not sent. An earlier order of the program may still move the vehicle, so a hold is ordered (see
-        `hold_in_background`). Raises BusyError if another stream is open, OperationRejected if the order has ended
-        during the block, and HeartbeatTimeout if the vehicle is silent after it.
+        The end of the block raises OperationRejected if the order has ended, and HeartbeatTimeout if the vehicle is
+        silent. After these errors and those of the block, the caller must not send the order. A hold is then ordered,
+        because an earlier order may still move the vehicle (see `hold_in_background`). Raises BusyError if another
+        stream is open.
         """
         self.check_no_stream()
         order = self._arbiter.order(mode)
@@ -302,7 +303,10 @@ class ArmCleanup:
     def hint(self) -> str:
         unsent = self._session.connection.unsent_bytes
         hint = f"; {unsent} bytes are still in the send buffer" if unsent else ""
-        return f"it may still be executed{hint}; if it arms the vehicle within {ARM_WATCH_S:g} s, aerokit disarms it"
+        return (
+            f"it may still be executed{hint}; if it arms the vehicle within {ARM_WATCH_S:g} s, and before the end of"
+            " the vehicle's `async with` block, aerokit disarms it"
+        )
 
     def watch(self, order: Order, was_armed: bool) -> None:
         """Watch in the background whether the abandoned arm command still arms the vehicle."""
@@ -368,7 +372,7 @@ class ArmCleanup:
         was_taken_over = order.takeover_reason or order.failsafe or not (mode_now == mode or was_ordered)
         if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
-        # A vehicle that reports armed later was armed by the order only if it has accepted the order.
+        # After a late report or a takeover, the order counts as the cause only if the vehicle has accepted it.
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)
         # A vehicle that was disarmed meanwhile and is armed again was armed by another party.

@@ -64,7 +64,7 @@ class Eight(ClosedPath):
         )
 
     def _to_north_east(self, along: float, across: float) -> Vector:
-        """Convert components along the axis, and to its right, to components north and east."""
+        """Convert the components along the axis and across it (positive to the right) to north and east."""
         cos, sin = math.cos(self._axis), math.sin(self._axis)
         return along * cos - across * sin, along * sin + across * cos
 

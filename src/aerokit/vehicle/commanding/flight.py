@@ -370,8 +370,8 @@ class ModeActions(VehicleBase):
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        This is so if the program armed the vehicle, or has given a steering order since another party armed it; and if
-        no pilot, failsafe or other program has taken over since. False for a vehicle that the program only observes.
+        The program must have armed the vehicle, or have given a steering order since another party armed it. No pilot,
+        failsafe or other program may have taken over since. False for a vehicle that the program only observes.
         """
         return self.telemetry.is_armed and self._arbiter.is_flown_by_program
 

@@ -138,13 +138,13 @@ class FollowStream(SteeringStream[TargetState]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving the block, also by an exception, makes the vehicle hold.
+    OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. Exception: after a newer
+    order, or a takeover by a pilot or a failsafe, the stream sends nothing more.
 
-    The stream stops by itself, and the vehicle holds, for the same reasons as a set-point stream, and also when no new
-    position of the target arrives for ``valid_for_s``, when the source of positions ends or raises, or when the target
-    is farther away than ``max_distance_m``. If a pilot or a failsafe changes the mode, the stream stops, and nothing
-    more is sent, not even an order to hold. After a stop, ``fly`` and leaving the block raise
-    :class:`SetpointStreamStopped`.
+    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but the vehicle may stay in place. It
+    also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or raises,
+    or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or else the
+    end of the block, raises :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.
@@ -250,7 +250,8 @@ class FollowStream(SteeringStream[TargetState]):
                         async for position in positions:
                             self._tracker.add(position)
                     finally:
-                        if isinstance(positions, AsyncGenerator):  # An invalid position has stopped the loop.
+                        # An invalid position stops the loop, but does not close the program's generator.
+                        if isinstance(positions, AsyncGenerator):
                             await positions.aclose()
                     self._end_reason = "the positions of the target ended"
                 except Exception as error:

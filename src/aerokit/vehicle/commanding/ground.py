@@ -86,7 +86,7 @@ class ImpactDetector:
         velocity, updated_at = cell.latest, cell.updated_at
         if velocity is None or updated_at == self._updated_at:
             return
-        if updated_at < self._updated_at:  # The computer slept: the velocity is older now, and not a new one.
+        if updated_at < self._updated_at:  # The computer slept, so the last velocity got an earlier time.
             self._updated_at, self._sank_fast_at = updated_at, -math.inf
             return
         # An impact may be shorter than the interval between two received velocities. It then shows in two consecutive
@@ -106,14 +106,13 @@ class ImpactDetector:
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s = self._max_sink_m_s
-                # The last known height, even if it is old: without one, no later height could show that the vehicle
-                # flies on.
+                # This height may be old. Without one, no later height could show that the vehicle flies on.
                 self._impact_height_m = height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.
             self._impact_m_s = None
             self._impact_height_m = None
-        # The vehicle does not sink now, so a descent can only begin at this height.
+        # While the vehicle does not sink, this is the height before the next descent.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S

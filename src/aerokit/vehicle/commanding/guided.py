@@ -1,6 +1,6 @@
 """Guided set-points, streamed at a fixed rate while a program supplies them.
 
-An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). A library that
+An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 1 s). A library that
 resends the last set-point without limit defeats that protection. aerokit ends the stream and orders the vehicle to hold
 when the code that supplies set-points ends, raises, is cancelled, stops supplying them, or blocks the event loop, and
 when the vehicle falls silent.
@@ -152,7 +152,7 @@ class Guided:
         Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
 
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
-        set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
+        set-point. Without a new one for ``valid_for_s``, aerokit orders a hold.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
 
@@ -213,13 +213,13 @@ class SetpointStream(SteeringStream[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
-    any way makes the vehicle hold.
+    any way, or a stop of the stream, orders the vehicle to hold. Exception: after a newer order, or a takeover by a
+    pilot or a failsafe, the stream sends nothing more.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
-    ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
-    positions and trajectories only), or stays in place for twelve seconds although it should move. After such a stop,
-    ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode,
-    nothing more is sent to the vehicle.
+    ``max_lag_s``. It stops if the vehicle leaves the mode, disarms or falls silent. It also stops if the vehicle hits
+    the ground (velocities, positions and trajectories only), or stays in place for twelve seconds although it should
+    move. The next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
     """
 
     _NAME, _VALUE = "set-point stream", "set-point"

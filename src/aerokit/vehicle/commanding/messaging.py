@@ -282,7 +282,7 @@ class MessagingActions(VehicleBase):
         or their effect is reported. The retries also end in these cases:
 
         - A newer order is given whose subjects include the first subject of this order.
-        - The mode changes to one that this program has not ordered, by this order or in the ten seconds before it. An
+        - The mode changes, and neither this order nor any order of the ten seconds before it asked for the new mode. An
           order to disarm is still retried.
         - A failsafe becomes active. An order to land, to return or to disarm is still retried.
         - The vehicle reboots or, if the first subject is ``"motion"``, disarms.
@@ -412,7 +412,7 @@ class MessagingActions(VehicleBase):
     def describe_now(self) -> str:
         """Return a text about the reported state.
 
-        For example: ``holding in BRAKE, still armed, 9 m above home, last heartbeat 0.3 s ago``.
+        For example: ``holding in BRAKE, still armed, 9.0 m above home, last heartbeat 0.3 s ago``.
         """
         return self._context.describe_now()
 

@@ -263,16 +263,14 @@ class Order:
             self.may_move = True
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
-            # Orders with `requires_mode_change` are posted ones, which are always settled, so their change always gets
-            # to the first branch.
             has_taken_effect = is_change or not self._requires_mode_change
             if has_taken_effect and is_settled:
                 self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
         elif is_expected and is_settled:
-            # An earlier order of the program has replaced these modes. If one of them appears again, it was set by
-            # another party.
+            # An earlier order of the program has changed the mode. If the mode from before appears again, another party
+            # has set it.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:

@@ -114,7 +114,8 @@ class PostedOrder:
             OperationTimeout: the vehicle accepted the mode but stayed in another mode.
         """
         if mode not in self._order.modes:
-            raise InvalidArgument(f"mode = {mode} is not allowed: this order does not lead to this mode")
+            allowed = ", ".join(map(str, self._order.modes)) or "none"
+            raise InvalidArgument(f"mode = {mode} is not allowed: it must be one of the modes of posted() ({allowed})")
         for attempts_left in reversed(range(MAX_MODE_ATTEMPTS)):
             try:
                 self._begin_command(MavCmd.DO_SET_MODE)

@@ -42,11 +42,10 @@ FRAME_TIMEOUT_S = 5.0
 
 
 class RoundFlight:
-    """One flight around a place, or to the place if there is no ``counter``.
+    """One flight to a place, and around it if there is a ``counter``.
 
     With ``rounds=None``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s.
-    ``center_name`` is the name of the public method's argument with the place, for error texts. The constructor raises
-    if the vehicle cannot fly there.
+    Error texts call the place ``center_name``. The constructor raises if the vehicle cannot fly there.
     """
 
     def __init__(

@@ -61,7 +61,7 @@ class OrderSender:
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
         self.raise_if_ended(order)
-        is_steering = STEERING in order.ending_topics  # A newer steering order would end this order.
+        is_steering = STEERING in order.ending_topics
         if order.was_sent and is_steering:
             await self.await_recent_state(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
@@ -98,10 +98,10 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for a recent HEARTBEAT before a further command of an order.
+        """Wait for a recent HEARTBEAT before a further command of an order. Before the first, ``order`` is None.
 
-        Without ``order``, nothing was sent yet. Raises OperationRejected if the order has ended or the computer slept,
-        and HeartbeatTimeout if there is no HEARTBEAT for ``MAX_SILENCE_S``.
+        Raises OperationRejected if the order has ended or the computer slept, and HeartbeatTimeout if there is no
+        HEARTBEAT for ``MAX_SILENCE_S``.
         """
         if order:
             self.raise_if_slept(order)
@@ -342,8 +342,7 @@ class OrderSender:
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries
         if options["attempt_timeout"] is None and not retries:
-            # A command that is sent only once gets one long time-out: as long as the time-outs of all attempts of a
-            # repeated command together.
+            # A command that is sent only once waits as long as a repeated command does in all its attempts.
             options["attempt_timeout"] = MAX_ATTEMPTS * ATTEMPT_TIMEOUT_S
         try:
             if command in REQUEST_COMMANDS:

@@ -145,8 +145,8 @@ class SimpleOrder(Snapshot):
     ) -> None:
         """Send the command and wait for a status text that reports its effect.
 
-        ``is_done(text, seconds_since_ack)`` is called repeatedly with every text received so far. It may thus accept an
-        old text once enough time has passed since the acknowledgement. The order must have no ``effect``.
+        At each check, ``is_done(text, seconds_since_ack)`` is called for every text received so far. It may accept an
+        old text when enough time has passed since the acknowledgement. Only for orders without ``effect``.
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """
@@ -183,7 +183,7 @@ class SimpleOrder(Snapshot):
         target: int,
         timeout: float,
     ) -> None:
-        """Request the message until it reports the effect. Returns early if the vehicle does not have it.
+        """Request the message until it reports the effect. Returns early if the vehicle does not have the message.
 
         ``target`` is the id of the component that sends the message.
         """

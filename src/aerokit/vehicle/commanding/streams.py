@@ -208,9 +208,9 @@ class ValueStream(Generic[ValueT]):
 class SteeringStream(ValueStream[ValueT]):
     """Flies the vehicle by values that the ``async with`` block supplies, in the flight mode for such values.
 
-    Entering the block changes to the mode. Leaving it in any way orders the vehicle to hold. If the stream stops by
-    itself, supplying a value and leaving the block raise :class:`SetpointStreamStopped`. If it stopped because a pilot
-    or a failsafe changed the mode, no hold is ordered.
+    Entering the block changes to the mode. Leaving it in any way orders the vehicle to hold, except after a newer order
+    or a takeover. If the stream stops by itself, the next value, or else the end of the block, raises
+    :class:`SetpointStreamStopped`.
     """
 
     _prepared_order: Order | None = None
@@ -269,7 +269,7 @@ class SteeringStream(ValueStream[ValueT]):
         return self
 
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
-        """Make the vehicle hold; if the stream has stopped by itself and the program does not know it yet, raise."""
+        """Order a hold. If the stream has stopped by itself, raise its error, unless it was raised before."""
         if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)
         if self._stop_error is None:
@@ -362,14 +362,14 @@ class TakeoverCheck:
     def raise_if_changed(self, operation: str) -> None:
         """Raise OperationRejected if an order was given, or if the mode was changed."""
         if self._arbiter.latest(STEERING) is not self._order_before:
-            raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")
+            raise OperationRejected(f"{operation}: {SUPERSEDED} meanwhile; this order was not sent")
         before, mode = self._mode_before, self._telemetry.mode.latest
         is_unchanged = before is None or mode == before
         # The end of a take-off, and a change to the mode that the caller wants to order, are not takeovers.
         is_end_of_take_off = (before, mode) == self._end_of_take_off
         if is_unchanged or mode == self._next_mode or is_end_of_take_off:
             return
-        raise OperationRejected(f"{operation}: the mode changed from {before} to {mode} before anything was ordered")
+        raise OperationRejected(f"{operation}: the mode changed from {before} to {mode}; the order was not sent")
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:

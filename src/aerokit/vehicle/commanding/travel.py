@@ -83,15 +83,16 @@ class TravelActions(VehicleBase):
         """Fly to a place and return on arrival.
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
-        order was given meanwhile or another party changed the mode. After a silence, aerokit waits for the next
-        heartbeat, and orders a hold if the vehicle is still on its way. Sends MAV_CMD_DO_REPOSITION
+        order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
+        next heartbeat. Sends MAV_CMD_DO_REPOSITION
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
         vehicle that does not support this command.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, only the
-                altitude above home is used. Home is always this vehicle's home, also for the position of another
-                vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the present altitude is kept.
+                altitude above home is used, and it counts from the home of this vehicle. A position of another vehicle
+                may count from another home. Without an altitude, or if the target is ``vehicle.home.value``, the
+                present altitude is kept.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -262,12 +263,12 @@ class TravelActions(VehicleBase):
         """Turn on the spot and return when the vehicle has this heading.
 
         An ArduPilot vehicle changes to GUIDED and gets MAV_CMD_CONDITION_YAW. PX4 does not support this command, so the
-        vehicle stops and turns by MAV_CMD_DO_REPOSITION.
+        vehicle stops and turns by MAV_CMD_DO_REPOSITION. After a cancellation, the vehicle continues to turn.
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left. The vehicle turns the shorter way to the new heading, but ArduPilot turns by a relative angle of
-                170 to 350 degrees in the direction of its sign.
+                left. The vehicle turns the shorter way. Exception: for a relative angle of 170 to 350 degrees,
+                ArduPilot turns right if the angle is positive, and left if it is negative.
             relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.

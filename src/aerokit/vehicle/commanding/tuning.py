@@ -66,8 +66,9 @@ class TuningActions(VehicleBase):
             with self._arbiter.auxiliary_order() as order:
                 while percent < TUNED_PERCENT:
                     if self.connection.now() - started > timeout:
+                        progress = "progress unknown" if percent < 0 else f"{percent} %"
                         raise OperationTimeout(
-                            f"autotune: not done within {timeout:g} s ({percent} %); PX4 may go on tuning"
+                            f"autotune: not done within {timeout:g} s ({progress}); PX4 may go on tuning"
                         )
                     answer = await self._poll(answers)
                     if answer.result not in (MavResult.IN_PROGRESS, MavResult.ACCEPTED):
