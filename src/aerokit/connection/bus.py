@@ -74,7 +74,7 @@ class Bus:
         return self._attach((system_id, message_type.ID), (MESSAGE, sink))
 
     def require_frames(self, *message_types: type[Message]) -> None:
-        """Make the framer return frames of these types even without a sink, for code that inspects every frame."""
+        """Make the framer return frames of these types even if no sink is attached."""
         for message_type in message_types:
             self.attach(message_type, _discard)
 
@@ -349,7 +349,7 @@ class Subscription(Generic[ItemT]):
         self._detachers: list[Detach] = []  # functions that end the subscription; empty before the `with` block
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._has_reader = False  # True from when a reader waits until it was resumed; a second reader is refused
+        self._has_reader = False  # True while a task is in `_wait`; a second one is refused
         self._waiter: asyncio.Future[None] | None = None  # wakes the waiting reader; None once it was woken
         self._error: Exception | None = None  # raised in the reader once the queue is empty
         self._closed = False
@@ -414,7 +414,7 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
-        if self._closed:  # An earlier sink of the same delivery has closed this subscription.
+        if self._closed:  # Another callback for this item, called before, has closed the subscription.
             return
         if len(self._queue) < self._capacity:
             self._queue.append(item)

@@ -158,8 +158,8 @@ class Connection:
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system. A message for all or for an unknown target goes
-        to every peer. With several links, :class:`DuplicateSender` may report that the link in use leads to another
-        vehicle with the same id. Messages to the vehicle are then not sent until another link works.
+        to every peer. With several links, nothing is sent over a link that leads to another vehicle with the same id
+        (:class:`DuplicateSender`).
 
         With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``. The
         message itself is not changed.
@@ -390,11 +390,10 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Return a probable problem with signatures, for error texts; "" if there is none.
+        """Return a hint for error texts if signatures are probably the problem; otherwise "".
 
-        If this program has a signing key, the problem is that it has refused frames of any sender. Without a key, it
-        is that the last heartbeat of this component was signed; this check needs a ``system_id``. ``component_id`` 0
-        means any component of the system.
+        With a signing key, the hint counts the refused frames of all senders. Without a key, it says that the last
+        heartbeat of this component was signed. ``component_id`` 0 means any component of the system.
         """
         return self._gate.describe(
             heartbeat

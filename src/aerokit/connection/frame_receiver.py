@@ -66,10 +66,7 @@ class PeerTable:
         yield from self._unverified.values()
 
     def receive_unverified(self, peer: Peer, data: bytes, now: float) -> tuple[Framer, list[Frame]]:
-        """Process bytes of a sender without a valid frame so far.
-
-        Returns its framer, and the frames to deliver.
-        """
+        """Process bytes from a sender that is not a peer yet. Return its framer, and the frames to deliver."""
         framer = self._unverified.get(peer)
         if framer is None:
             framer = self._add_unverified(peer)

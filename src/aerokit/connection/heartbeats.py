@@ -131,14 +131,11 @@ class HeartbeatWatchdog:
         self._clock, self._publish = clock, publish
         self._paused_at: float | None = None  # None while heartbeats are sent
 
-    def watch(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Pause heartbeats while the program is idle for too long.
-
-        ``fed_within_s`` is the limit if the settings have none.
-        """
+    def watch(self, activity: ActivityMonitor, default_limit_s: float) -> None:
+        """Pause heartbeats while ``activity`` is idle for longer than the limit of the settings, or the default."""
         self.activity = activity
         if self._limit_s is None:
-            self._limit_s = fed_within_s
+            self._limit_s = default_limit_s
 
     def should_send(self) -> bool:
         idle_s = self.activity.idle_s

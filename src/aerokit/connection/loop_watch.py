@@ -80,10 +80,10 @@ class LoopWatch:
         self._due = self._ran_at  # when the timer should fire
         self._timer: asyncio.TimerHandle | None = None  # None before start() and after close()
         self.oldest_arrival: float = math.inf
-        """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
+        """Earliest possible receive time of data that is read now; infinite if the data cannot have waited."""
         # The last times at which the computer woke, with the seconds for which it was suspended.
         self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
-        # While data may have waited, `arrival` does not read the clocks before this time, because reading is slow.
+        # While waiting data is read, the next time at which `arrival` checks for a suspension, which is slow.
         self._check_sleep_at = -math.inf
         self._has_read = False  # True if data was read since the last call of `_end_assumption_when_idle`
         self._idle_iterations = 0  # number of consecutive loop iterations in which nothing was read
@@ -160,7 +160,7 @@ class LoopWatch:
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _assume_waiting_data(self) -> float:
-        """Return `oldest_arrival`. If it is infinite, first set it to the time at which the loop last ran."""
+        """Assume that data arrived during the pause, and return its earliest possible receive time."""
         if self.oldest_arrival == math.inf:
             self.oldest_arrival = self._ran_at
             self.late_after = -math.inf

@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Evidence that another peer's frame continues the owner's stream, or that it does not. None means unknown."""
+    """Whether a frame from another peer continues the stream of the route's owner. None means unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
@@ -38,9 +38,8 @@ class Evidence(NamedTuple):
 class RouteClaim:
     """Evidence on whether a component now sends from another peer of the link.
 
-    The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
-    the component claims the route. When the owner sends again, the claim starts anew. Only the sequence number of the
-    claim's first frame is evidence, because a peer could try many numbers until one matches.
+    The owner of a route is the peer to which messages for the component are sent. Another peer that sends with the ids
+    of the component claims the route. When the owner sends again, the claim starts anew.
     """
 
     __slots__ = (
@@ -232,10 +231,7 @@ class Routes:
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Record the claim of ``peer`` to the sender's route. Return True if the route was moved to it.
-
-        Refused claims and moves are published.
-        """
+        """Record the claim of ``peer`` to the sender's route. Return True if the peer now owns the route."""
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
@@ -356,7 +352,7 @@ class Routes:
         return len(self._routes) < MAX_ROUTES
 
 
-_SAME_PEER = object()  # stands for the peer in claims of a second sender that sends through the owner's peer
+_SAME_PEER = object()  # used as the peer in claims of a second sender that is received from the owner's peer
 
 
 def _peer_name(peer: Peer) -> str:

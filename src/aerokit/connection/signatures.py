@@ -41,8 +41,8 @@ class SignatureGate:
         self._reported: set[Refusal] = set()  # reasons that were already logged
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True inside the `with` block of key_handover()
-        self._logged_keep_error: OSError | None = None  # None if the file of ``Signing(keep=…)`` could be written
-        # Before the first frame, the owner calls `set_signing`, and this call updates `is_open`.
+        self._logged_keep_error: OSError | None = None  # last logged error of writing the file of ``Signing(keep=…)``
+        # The owner calls `set_signing`, which sets the actual value, before the first frame.
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = lambda: None
@@ -64,8 +64,8 @@ class SignatureGate:
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
         """Switch to ``signing`` when frames of the component show that it uses the new key.
 
-        The old key signs and verifies until the switch, which sets the yielded event. None means that the component
-        stops signing. Raises BusyError if another handover is in progress.
+        Until then, the old key signs and verifies. The switch sets the yielded event. With ``signing=None``, the
+        component is to stop signing. Raises BusyError if another handover is in progress.
         """
         check_signing(signing, self._encoder.version)
         if self._is_handing_over:
@@ -136,9 +136,9 @@ class SignatureGate:
         self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Return a probable problem with signatures, for error texts. Empty if there is none.
+        """Return a hint for error texts if signatures are probably the problem. Empty if not.
 
-        With a key, the problem is that frames were refused. Without a key, it is that one of ``heartbeats`` is signed.
+        With a key, the hint counts refused frames. Without a key, it says that one of ``heartbeats`` is signed.
         """
         signing = self._encoder.signing
         if signing is not None:

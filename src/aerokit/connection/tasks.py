@@ -24,8 +24,8 @@ class BackgroundTasks:
     ``task.cancel()``, ``asyncio.timeout`` and ``asyncio.TaskGroup`` behave differently in each version of Python and
     anyio; in some versions, exceptions are lost or exchanged.
 
-    If the program cancels a scope of its own, these tasks continue: heartbeats are sent while a shielded program lands
-    its vehicle.
+    The tasks continue when the program cancels a scope of its own. Heartbeats are therefore sent while shielded code
+    lands the vehicle.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:

@@ -39,7 +39,7 @@ _READ_SIZE = 4096
 
 _LINGER_STEP_S = 0.005
 
-_MAX_BUFFER_S = 2.0  # The write buffer holds data for this time. Older data would be outdated when it arrives.
+_MAX_BUFFER_S = 2.0  # The write buffer holds as much data as the port sends in this time.
 
 
 class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types

@@ -16,11 +16,10 @@ if TYPE_CHECKING:
 
 MAX_REMEMBERED = 4096  # number of remembered frames, enough for 10 s at 400 frames per second
 
-# An equal frame over another link is always a duplicate if it arrives within this time after the first.
+# An equal frame over another link is a copy if it arrives within this time after the first.
 COPY_WINDOW_S = 3.0
 
-# A copy over a slow link may arrive up to this time after the first copy. After COPY_WINDOW_S, an equal frame can
-# only be a duplicate if the first copy was accepted.
+# Over a slow link, a copy of an accepted frame may arrive this late.
 LATE_COPY_WINDOW_S = 10.0
 
 # An equal frame counts as a new frame, not as a copy, if the sender has sent at least this many frames in between.
@@ -36,7 +35,7 @@ class _Seen:
     def __init__(self, at: float, link_bit: int, count: int) -> None:
         self.at = at  # receive time of the first copy
         self.link_bits = link_bit  # has one bit for each link over which the frame arrived
-        self.proving_bits = 0  # the same, without links over which a second sender with the same ids sent it
+        self.proving_bits = 0  # the same, except links over which it came from a second sender with the same ids
         self.count = count  # number of the sender's frames, this one included, when it arrived
         self.is_admitted = False  # see `Copies.was_admitted`
         self.is_accepted = False  # see `Copies.was_accepted`
@@ -100,7 +99,7 @@ class Copies:
         return self._current is not None and self._current.is_admitted
 
     def arrived_over(self, link: int) -> bool:
-        """Return True if the last checked frame, or a copy of it, arrived over this link."""
+        """Return True if the last checked frame, or a copy of it, arrived over this link from the first sender."""
         return self._current is not None and bool(self._current.proving_bits & 1 << link)
 
     def admit(self) -> None:
@@ -177,8 +176,8 @@ class MergedStreams:
     def was_accepted(self, frame: Frame, link: int, *, may_prove: bool) -> bool:
         """Return True if this frame is a copy of a frame that was accepted over another link.
 
-        The call then records that the frame's link works. ``may_prove`` is False if a second sender with the same ids
-        sent the frame.
+        ``may_prove`` is False if a second sender with the same ids sent the frame. The copy then does not prove that
+        its link leads to the vehicle.
         """
         if not self.copies.is_copy(frame, link, may_prove=may_prove):
             return False
@@ -200,13 +199,14 @@ class MergedStreams:
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # A copy is evidence only once the link in use has delivered it, too. It then counts for all faster links.
+            # When the link in use delivers the frame, it counts for all links that delivered it earlier. A copy that
+            # arrives later counts for its own link and the link in use.
             is_new = link == used.link or candidate.link in (link, used.link)
             if is_new and self.copies.arrived_over(candidate.link):
                 candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Decide whether to deliver a frame that is no copy, and record it if so."""
+        """Return True if a frame that is not a copy is to be delivered."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)

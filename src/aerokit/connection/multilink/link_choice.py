@@ -36,7 +36,7 @@ class Candidate:
         self.link = link
         self.is_costly = is_costly
         self.received_at: float = now
-        """Time of the last frame of the system over the link, up to an interval of `record_counts` (0.1 s) too late."""
+        """Time of the last frame received from the system over the link. May be 0.1 s too late."""
         self.answered_at: float = -math.inf
         """Time of the last answer to a probe."""
         self.shared_at: float = -math.inf
@@ -46,7 +46,7 @@ class Candidate:
         self.is_stalled: bool = False
         """True while written data stays in this machine's buffers."""
         self.loss: float | None = None
-        """Fraction of frames lost, mostly of the last dozen frames, 0 to 1; None if unknown. A silence keeps it."""
+        """Fraction of frames lost, 0 to 1, mostly of the last dozen frames. None if unknown."""
         self.round_trip_s: float | None = None
         """Smoothed round-trip time of the probes; None before the first answer."""
         self.is_proven: bool = False
@@ -58,7 +58,7 @@ class Candidate:
         self.hardware: HardwareId | None = None
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
-        """True if :attr:`hardware` is another vehicle's. The link is then not proven by its clock or by copies."""
+        """True if :attr:`hardware` is another vehicle's id. A matching clock or copies then prove nothing."""
         # Numbers of requests for the hardware id, and of TIMESYNC answers since the first request.
         self._hardware_requests = self._answers_since_request = 0
         # Numbers of consecutive matches and mismatches of the clock, and of copies since the proof was last reset.
@@ -69,7 +69,7 @@ class Candidate:
         received_before, lost_before = self._last_counts
         self._last_counts = received, lost
         if received > received_before:
-            self.received_at = now
+            self.received_at = now  # The frame arrived after the previous call, up to 0.1 s ago.
         # A total is smaller than before if its counters were replaced, e.g. because a peer was evicted.
         new_received, new_lost = max(0, received - received_before), max(0, lost - lost_before)
         if new_received or new_lost:
@@ -330,7 +330,7 @@ class LinkChoice:
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return
-        # An id that contradicts the id from another link is not adopted: the link in use leads to another vehicle.
+        # If the id contradicts the vehicle's id, which came over another link, this link leads to another vehicle.
         is_from_same_link = self._hardware_link == used.link
         if self.hardware is None or is_from_same_link or not self.hardware.contradicts(hardware):
             self.hardware, self._hardware_link = hardware, used.link
@@ -347,8 +347,8 @@ class LinkChoice:
             # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
             self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
-            # The chosen link was proven by comparison with the previous one (see `may_be_used`), so both lead to one
-            # vehicle. Only a hardware id can disprove this, because the clock of a link in use is not compared.
+            # The chosen link was proven by comparison with the previous one (see `may_be_used`). Both therefore lead
+            # to the same vehicle, unless their hardware ids differ.
             previous.is_proven = not previous.is_other_hardware
         self.previous = previous
         self.used = chosen

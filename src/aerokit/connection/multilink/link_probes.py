@@ -40,8 +40,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, or every five seconds if the link is costly and not in use.
 
-    Answers are recorded in ``choices``. A link to a second vehicle with the same system id is reported once. It is
-    reported again if it has led to the known vehicle in between. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A link that leads to another vehicle with the same system id is reported.
+    ``send(message, peer)`` sends a probe.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class LinkProbes:
     def is_answer(self, frame: Frame, link: int) -> bool:
         """Return True if this TIMESYNC answers one of our probes over any link.
 
-        The call records an answer of the autopilot that arrived over the link of its probe.
+        The call records the answer if the autopilot sent it over the link of the probe.
         """
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
@@ -154,7 +154,7 @@ class LinkProbes:
         """Report once that the link seems to lead to another vehicle with the same system id."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
-            self._reported.discard(key)
+            self._reported.discard(key)  # It is reported again if the link leads to another vehicle later.
         elif key not in self._reported:
             self._reported.add(key)
             logger.warning(

@@ -82,7 +82,7 @@ class ZenohConnect(NetworkLink):
         self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
-        # True while control must be requested, which ends when a beacon shows that this client has it.
+        # With control="take", True until a beacon shows that this client has control.
         self._takes_control = control == "take"
         self._nonce = random.getrandbits(32)  # distinguishes this link from others that use the same client name
         self._tracker = VehicleSideTracker(self._nonce, "never" if control == "never" else "free")

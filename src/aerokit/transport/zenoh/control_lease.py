@@ -94,7 +94,7 @@ def is_read_only(frame: Frame) -> bool:
 
 
 def rejection_frames(answer: bytes) -> tuple[bytes, ...]:
-    """Return the frames of a notice's ``answer`` that reject a command."""
+    """Split the bytes of `RefusalNotice.answer` into frames, and return those that reject a command."""
     return tuple(frame.raw for frame in Framer().receive(answer) if _is_rejection(_decoded(frame)))
 
 
@@ -355,7 +355,7 @@ class DelayEstimator:
 
 
 class VehicleSideTracker:
-    """Tracks a vehicle's end of the link by its beacons, and creates the stamps of datagrams. Used by clients."""
+    """Used by clients: tracks the vehicle side, i.e. the program that serves the vehicle, and stamps datagrams."""
 
     def __init__(self, nonce: int, mode: ControlMode = "free") -> None:
         self.epoch: int | None = None
@@ -377,7 +377,6 @@ class VehicleSideTracker:
         """Record a beacon. Return False for a beacon that is ignored.
 
         A beacon is ignored if it is late, if a newer one was already received, or if another vehicle side has sent it.
-        A vehicle side is a program that serves the vehicle to clients.
         """
         if beacon.epoch != self.epoch:
             if self.epoch is not None and not self.is_silent(now):
@@ -399,7 +398,7 @@ class VehicleSideTracker:
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
         """Return True if a datagram is on time and from the tracked vehicle side.
 
-        A vehicle side is a program that serves the vehicle to clients. ``sent_s`` is the send time on its clock.
+        ``sent_s`` is the send time on the vehicle side's clock.
         """
         if epoch != self.epoch:
             self.foreign += 1

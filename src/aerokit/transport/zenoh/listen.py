@@ -72,7 +72,7 @@ class ZenohListen(NetworkLink):
         self._zenoh: Any = None  # the imported module; None before the opening
         self._publisher: Any = None  # sends to all clients; None while the link is not open
         self._may_have_rival = False  # True if a liveliness token shows that the name may be in use
-        self._is_serving = False  # True from the end of the opening on
+        self._is_serving = False  # True while clients are served
         self._rival_found = asyncio.Event()  # set when another vehicle side sends a beacon under this name
         self._beacon_at = 0.0  # time of the last own beacon
 
@@ -124,15 +124,12 @@ class ZenohListen(NetworkLink):
                 # After a time-out, the block ends in the line above. This line is reached only if a beacon arrived.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         with zenoh_errors(self.address, self._zenoh):
-            await open_in_thread(partial(self._serve, queue, session), _nothing)
+            await open_in_thread(partial(self._serve, queue, session))
         self._is_serving = True
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
-        """Find out whether the name may be in use, and subscribe to beacons.
-
-        Runs on a thread of the executor.
-        """
+        """Subscribe to beacons, and check whether the name may be in use. Runs on a thread of the executor."""
 
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
@@ -271,10 +268,6 @@ class ZenohListen(NetworkLink):
             put()
         except Exception:  # zenoh raises various errors after its session has ended.
             self._drop(1)
-
-
-def _nothing(_: object) -> None:
-    pass
 
 
 def _client_of(sample: Any) -> str:
