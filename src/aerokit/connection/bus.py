@@ -56,8 +56,8 @@ _HEARTBEAT_ID = 0
 class Bus:
     """Delivers messages and events to the attached sinks, in the order in which they were attached.
 
-    ``wanted`` maps each message id for which a sink is attached to the number of its sinks. It is updated in place, so
-    that a framer that is given this mapping skips all other frames.
+    ``wanted`` has the number of sinks for each message id with at least one sink. It is updated in place. A framer that
+    is given this mapping skips all other frames.
     """
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:

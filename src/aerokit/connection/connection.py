@@ -90,8 +90,8 @@ class Connection:
     ) -> None:
         if not 1 <= source_system <= 255:
             raise InvalidArgument(f"source_system = {source_system} is not allowed: it must be 1 to 255")
-        # 0 is the broadcast id, but DroneKit programs send with it. Answers to it look as if they were for all
-        # components of our system.
+        # 0 is the broadcast id, but DroneKit programs send with it. The vehicle's answers then look as if they were for
+        # all components of our system.
         if not 0 <= source_component <= 255:
             raise InvalidArgument(f"source_component = {source_component} is not allowed: it must be 0 to 255")
         _check_version(mavlink_version)
@@ -332,7 +332,7 @@ class Connection:
         return self._observers.add_sent(callback)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise InvalidArgument if ``types`` is empty, or an item is no event class or message class of the dialect."""
+        """Raise InvalidArgument if ``types`` is empty, or an item is neither an event nor a message of the dialect."""
         if not types:
             raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
@@ -421,7 +421,7 @@ class Connection:
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close the connection because of an internal error of aerokit. Errors raised later have it as their cause."""
+        """Close the connection because of an internal error of aerokit, which becomes the cause of all later errors."""
         if not self.is_open and isinstance(error, AerokitError):
             return  # A background task failed only because the connection was closed before.
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)

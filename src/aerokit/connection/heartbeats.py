@@ -76,12 +76,12 @@ logger: logging.Logger = logging.getLogger("aerokit")
 class OwnHeartbeat(Snapshot):
     """Settings of the HEARTBEAT that aerokit sends at 1 Hz (https://mavlink.io/en/services/heartbeat.html).
 
-    A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program hangs,
-    i.e. when it has called neither aerokit nor ``feed()`` for ``fed_within_s`` seconds (infinity: never).
+    A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program seems to
+    hang, i.e. when it has been inactive for ``fed_within_s`` seconds (infinity: never).
 
-    In :mod:`aerokit.sync` and :mod:`aerokit.dronekit`, ``fed_within_s`` is 60 by default (None), because their event
-    loop runs on a separate thread. In asyncio, it is infinity by default, because a blocked loop sends nothing anyway.
-    If you set a number in asyncio, call ``feed()`` regularly, because other calls do not count there.
+    In :mod:`aerokit.sync` and :mod:`aerokit.dronekit`, each call of aerokit counts as activity, and the default (None)
+    is 60 s. In asyncio, only ``feed()`` counts. The default there is infinity, because a blocked loop sends nothing
+    anyway.
 
     ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18 for a companion computer (ONBOARD_CONTROLLER).
     """

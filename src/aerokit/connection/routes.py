@@ -88,7 +88,8 @@ class RouteClaim:
 
         ``rate`` is the owner's number of frames per second.
         """
-        # The claim must last as long as the owner needs for three frames. A frame of the owner ends it.
+        # The claim must last for the time in which the owner usually sends three frames. Any frame of the owner ends
+        # the claim.
         return (
             self.continues_owner
             and self._frames >= CLAIM_MIN_FRAMES
@@ -152,13 +153,13 @@ class Routes:
 
     Another peer takes over the route (``RouteChanged``)
 
-    1. at once, if it is another port of the same host and has continued the stream with three frames, while the owner
-       sent nothing for the time of three frames;
+    1. at once, if it is another port of the same host and has continued the stream with three frames, and the owner has
+       sent nothing for as long as it usually needs for three frames;
     2. when the owner is gone, if the peer is on the same host (as after a reboot), continues the stream, or signs with
        our key;
     3. when the owner is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
 
-    Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
+    A peer that was refused (``RouteChangeRefused``) is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.
 
     ``attached`` has the system ids with a vehicle object. ``boot_clocks[component](received_at)`` returns the expected
@@ -226,7 +227,7 @@ class Routes:
         return peers or EVERY_PEER
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
-        """Return True if the frame came from ``peer``, but messages to its sender are sent to another peer."""
+        """Return True if the frame came from ``peer``, but another peer owns its sender's route."""
         route = self._routes.get((frame.system_id, frame.component_id))
         return route is not None and route.peer != peer
 

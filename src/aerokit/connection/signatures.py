@@ -87,7 +87,7 @@ class SignatureGate:
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
         """Return True if a frame may be delivered. A frame with the new key causes the switch of :meth:`key_handover`.
 
-        ``may_hand_over`` is False for a frame from another peer than its component's. Such a frame causes no switch.
+        With ``may_hand_over=False``, it causes no switch, because it came from another peer than the component's.
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)

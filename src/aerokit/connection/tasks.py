@@ -37,7 +37,7 @@ class BackgroundTasks:
         return len(self._tasks)
 
     def start(self, function: Callable[[], Awaitable[None]], name: str | None = None) -> asyncio.Task[None] | None:
-        """Run ``function()`` in a new task, and return the task. Return None after :meth:`cancel`.
+        """Run ``function()`` in a new task, and return the task. After :meth:`cancel`, only return None.
 
         A task that is cancelled before its first step never calls the function.
         """

@@ -43,7 +43,7 @@ class MemberLinkListener(Receiver, Protocol):
 
 
 class MultiLink(Link):
-    """Several links to the same vehicles. Those that cannot be opened are retried, if at least one can.
+    """Several links to the same vehicles. If at least one can be opened, the others are retried.
 
     Args:
         factories: functions that create the links, called for the first and every later attempt to open them.

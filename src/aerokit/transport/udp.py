@@ -170,7 +170,7 @@ class UdpListen(_UdpLink):
     def peers(self) -> tuple[Peer, ...]:
         """Remembered peers, newest first.
 
-        They are ordered by their last datagrams or, if the receiver keeps peers, by the time they were added.
+        They are ordered by their last datagrams or, if the receiver is a `PeerKeeper`, by the time they were added.
         """
         return tuple(reversed(self._peers))
 

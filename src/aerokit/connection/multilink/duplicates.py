@@ -59,8 +59,8 @@ class Copies:
     def is_copy(self, frame: Frame, link: int, *, may_prove: bool = True) -> bool:
         """Remember a frame. Return True if an equal frame arrived recently, but only over other links.
 
-        The other members refer to the frame of the latest call. ``may_prove`` is False if a second sender with the
-        same ids sent the frame.
+        The other methods refer to the frame of the latest call. With ``may_prove=False``, :meth:`arrived_over` ignores
+        this copy, because a second sender with the same ids sent it.
         """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
@@ -99,7 +99,7 @@ class Copies:
         return self._current is not None and self._current.is_admitted
 
     def arrived_over(self, link: int) -> bool:
-        """Return True if the last checked frame, or a copy of it, arrived over this link from the first sender."""
+        """Return True if the last checked frame, or a copy of it, arrived over this link."""
         return self._current is not None and bool(self._current.proving_bits & 1 << link)
 
     def admit(self) -> None:
@@ -160,9 +160,9 @@ class _Stream:
 class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
-    Two links to different ports of an autopilot carry separate streams, because each port has its own sequence numbers.
-    A frame over the link that is not in use may then be older than accepted frames. It is accepted only if it is a late
-    answer, or if the link in use does not reach its component. ``choices`` has the links to each system.
+    If the links lead to different ports of an autopilot, their sequence numbers cannot be compared, because each port
+    has its own. Only frames over the link in use are then accepted, apart from late answers and components that this
+    link does not reach. ``choices`` has the links to each system.
     """
 
     def __init__(self, link_count: int, choices: Mapping[int, LinkChoice]) -> None:

@@ -20,7 +20,7 @@ UNPROBED_TIMEOUT_S = 2.5
 # This many consecutive matching clock samples prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
-# After this many answers to TIMESYNC probes, an answer to an earlier request for the hardware id is no longer expected.
+# A request for the hardware id counts as unanswered after this many later answers to TIMESYNC probes.
 MAX_ANSWERS_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
@@ -86,7 +86,7 @@ class Candidate:
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        ``may_prove`` is False while an answer with the hardware id is expected.
+        With ``may_prove=False``, matches do not prove the link yet, because its hardware id is still awaited.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
@@ -205,8 +205,8 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, which was received over the link in use at that time."""
-        # Index of the link whose next id replaces `hardware` even if it differs; -1 if there is none. This link has
-        # delivered `hardware`, or has shown that the vehicle rebooted.
+        # Index of the link that delivered `hardware`, or over which a later reboot was detected; -1 if there is none.
+        # The next id over this link replaces `hardware` even if it differs.
         self._hardware_link = -1
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
@@ -236,8 +236,8 @@ class LinkChoice:
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record a probe's answer. The vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
         candidate = self.candidates[link]
-        # True if the link in use has not answered since the previous answer over this link. `record_round_trip` changes
-        # this time, so it is called afterwards.
+        # True if the link in use has not answered since the previous answer over this link, whose time
+        # `record_round_trip` replaces below.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:

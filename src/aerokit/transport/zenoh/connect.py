@@ -183,8 +183,8 @@ class ZenohConnect(NetworkLink):
         self._first_beacon.set()
         if self._takes_control:
             self._takes_control = beacon.lease_holder != self.client
-            # An empty datagram with mode "take" requests control. Once this client holds the control lease, one more is
-            # sent with its usual mode.
+            # An empty datagram with mode "take" requests control. Once this client has control, a last one is sent with
+            # the usual mode.
             self._put(b"", self._requested_mode())
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:

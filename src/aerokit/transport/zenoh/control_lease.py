@@ -330,13 +330,14 @@ class FreshnessChecker:
 
 
 class DelayEstimator:
-    """Estimates the delay of received data, relative to the smallest delay so far, which counts as zero.
+    """Estimates how much longer received data was under way than the fastest data so far.
 
-    The clocks need the same rate, not the same time. A constant delay from the start is not detected.
+    The sender's clock may show any time, but must run at the same rate as ours. A delay that was constant from the
+    start is not detected.
     """
 
     def __init__(self) -> None:
-        self._min_offset: float | None = None  # smallest difference so far of our time and the sender's send time
+        self._min_offset: float | None = None  # smallest difference so far between receive time and send time
         self._measured_at = 0.0  # time at which `_min_offset` was measured
 
     def delay(self, sent_s: float, now: float) -> float:

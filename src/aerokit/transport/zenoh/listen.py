@@ -49,8 +49,8 @@ logger: logging.Logger = logging.getLogger("aerokit")
 class ZenohListen(NetworkLink):
     """``zenohin:`` link: serves the clients (`ZenohConnect`) that use its name. Each client is a peer.
 
-    The link is not lost when clients or the network fail. Outdated datagrams, and commands while another client has
-    control, are refused and counted, and the client is notified.
+    The link is not lost when clients or the network fail. Outdated datagrams are refused, and so are commands while
+    another client has control. Refused frames are counted, and the client is notified.
 
     Args:
         fleet: name of the fleet, up to 63 letters, digits, ``_``, ``.`` and ``-``.
@@ -210,7 +210,7 @@ class ZenohListen(NetworkLink):
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
         if client is None and len(self._clients) < MAX_CLIENTS:
-            with contextlib.suppress(InvalidArgument):  # A client of aerokit never has a name that is not allowed.
+            with contextlib.suppress(InvalidArgument):  # A program other than aerokit may use a wrong name.
                 client = self._clients[name] = ClientFilter(check_name("client", name), self._lease)
                 client.received_at = self._now()
         return client

@@ -164,7 +164,7 @@ class NetworkLink(BaseLink):
 
 
 async def open_session(address: str, options: NetworkOptions, declare: Callable[[Any, Any], object]) -> Any:
-    """Open a session, and call ``declare(zenoh, session)`` in the same thread, where declarations may block.
+    """Open a session in a thread, and call ``declare(zenoh, session)`` there, because declarations may block.
 
     Raises:
         LinkOpenError: zenoh is not installed, or the session could not be opened.
