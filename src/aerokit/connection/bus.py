@@ -33,7 +33,7 @@ __all__ = ["Bus", "Detach", "EndSignal", "Overflow", "Sink", "Subscription", "co
 logger: logging.Logger = logging.getLogger("aerokit")
 
 Detach = Callable[[], None]
-"""Function that ends an attachment of a sink. A second call does nothing."""
+"""Function that detaches a sink. A second call does nothing."""
 
 Sink = Callable[[Any], None]
 """Callback for one message, frame or event. The callback must return quickly and cannot await."""
@@ -45,8 +45,8 @@ _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# (kind, all sinks): MESSAGE if every sink takes only the message, FRAME if no sink needs the message decoded, otherwise
-# BOTH.
+# (kind, all sinks). The kind is MESSAGE if every sink takes only the message, FRAME if no sink needs the message
+# decoded, otherwise BOTH.
 _DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
@@ -95,16 +95,16 @@ class Bus:
     def create_on_first(
         self, message_ids: Iterable[int], create: Callable[[], object], *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
-        """Call ``create()`` when the first of these messages arrives, and before the message is delivered.
+        """Call ``create()`` when the first of these messages arrives, before the message is delivered.
 
-        If ``create()`` raises, it is called again with the next message; otherwise it is called once. Sinks that it
+        If ``create()`` raises, it is called again at the next message; otherwise it is called once. Sinks that it
         attaches get the first message too. Returns a function that cancels the call.
         """
 
         def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
-            detach_all()  # This function is defined further down. No frame arrives until then.
+            detach_all()  # It is defined below, before any frame arrives.
             # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
                 if entry not in entries_before:
@@ -279,7 +279,7 @@ class EndSignal:
 
     def __init__(self) -> None:
         self.error: Exception | None = None
-        """The error that ended the owner, set by the owner before it calls :meth:`notify`; None before that."""
+        """The error that ended the owner; None until then. The owner sets it before it calls :meth:`notify`."""
         self._callbacks: list[EndCallback] = []
 
     def raise_if_ended(self) -> None:

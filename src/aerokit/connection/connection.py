@@ -433,7 +433,7 @@ class Connection:
         """Record all sent and received frames to a ``.tlog`` file until the connection is closed.
 
         A file that exists already stays as it is until the first frame is received. It is then renamed to the next free
-        number (``flight.1.tlog``), and the recording begins with the frames sent before that, at most the last 1000.
+        number (``flight.1.tlog``). The recording begins with the frames that were sent until then, at most 1000.
 
         Raises:
             LinkOpenError: the file cannot be written.
@@ -561,7 +561,7 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
-        """Write a frame to the peers that lead to the target of ``message``, or to all peers if it has no target.
+        """Write a frame to the peers of the target of ``message``, or to all peers if it has no target.
 
         With ``to``, the target is the system with this id instead. Returns False if nothing was sent.
         """

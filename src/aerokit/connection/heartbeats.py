@@ -68,7 +68,7 @@ def discovery_event(
 
 
 BLOCKING_MAX_IDLE_S = 60.0
-"""The heartbeat of a blocking program pauses after this many seconds without a call. Programs rarely sleep longer."""
+"""In the blocking API, heartbeats pause after this many seconds without a call. Programs rarely sleep longer."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -132,7 +132,10 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None  # None while heartbeats are sent
 
     def watch(self, activity: ActivityMonitor, default_limit_s: float) -> None:
-        """Pause heartbeats while ``activity`` is idle for longer than the limit of the settings, or the default."""
+        """Pause heartbeats while ``activity`` is idle for longer than the settings allow.
+
+        ``default_limit_s`` is the limit if the settings have none.
+        """
         self.activity = activity
         if self._limit_s is None:
             self._limit_s = default_limit_s

@@ -148,8 +148,8 @@ class Routes:
 
     The first peer that sends a HEARTBEAT under these ids owns the route. Frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer continues the owner's stream if its sequence numbers and, where known,
-    its time since boot are those expected of the owner. The owner is gone once its TCP client has disconnected, or
-    after 3.5 s without a heartbeat, not counting pauses of the event loop.
+    its time since boot are those expected of the owner. The owner is gone once it has disconnected, or after 3.5 s
+    without a heartbeat, not counting pauses of the event loop.
 
     Another peer takes over the route (``RouteChanged``)
 

@@ -210,7 +210,7 @@ class MultiLink(Link):
         finally:  # The caller may be cancelled again; anyio does so at each await.
             for link in self._own_links:
                 link.close()
-            # A closed link cannot be opened again.
+            # A closed link cannot be opened again, so it is replaced.
             for index, make_link in enumerate(self._factories):
                 if index not in self._foreign:
                     self._links[index] = make_link()

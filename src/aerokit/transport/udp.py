@@ -33,7 +33,7 @@ MAX_PEERS = 256
 """Maximum number of peers if the receiver is not a `PeerKeeper`. A new peer replaces the least recent one."""
 
 REMOTE_TIMEOUT_S = 3.5
-"""After this silence of the peer that answered a broadcast, its address may have changed, so broadcasts start again."""
+"""A `UdpBroadcast` broadcasts again after this silence of its peer, because the peer's address may have changed."""
 
 _MAX_DATAGRAM_BYTES = 65535
 _RECEIVE_BUFFER = 1024 * 1024  # enough for a burst of a log download that arrives while the program is busy

@@ -35,8 +35,8 @@ class _Seen:
     def __init__(self, at: float, link_bit: int, count: int) -> None:
         self.at = at  # receive time of the first copy
         self.link_bits = link_bit  # has one bit for each link over which the frame arrived
-        self.proving_bits = 0  # the same, except links over which it came from a second sender with the same ids
-        self.count = count  # number of the sender's frames, this one included, when it arrived
+        self.proving_bits = 0  # the same, except links over which a second sender with the same ids sent the frame
+        self.count = count  # number of frames received from the sender until then, this one included
         self.is_admitted = False  # see `Copies.was_admitted`
         self.is_accepted = False  # see `Copies.was_accepted`
 
@@ -151,7 +151,7 @@ class _Stream:
         return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
 
     def is_repeated(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement. Return True if another link delivered it at least as often."""
+        """Count an acknowledgement. Return True if another link delivered it at least as often as this link."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for index, count in enumerate(counts) if index != link)
@@ -182,9 +182,9 @@ class MergedStreams:
         if not self.copies.is_copy(frame, link, may_prove=may_prove):
             return False
         choice = self._choices.get(frame.system_id)
-        # Equal frames prove that their links lead to one vehicle if they contain the time since boot. Frames without
-        # that time, such as heartbeats, may be equal although they come from two vehicles. Frames that were refused
-        # prove nothing, because any sender can send them over two links.
+        # Equal frames with a time since boot prove that their links lead to one vehicle. Other frames, such as
+        # heartbeats, may be equal although they come from two vehicles. Frames that the signature check refused prove
+        # nothing, because any sender can send them over two links.
         if choice is not None and boot_time_ms(frame) and self.copies.was_admitted:
             self._record_copy(choice, link, frame.received_at)
         if not self.copies.was_accepted:
@@ -195,12 +195,12 @@ class MergedStreams:
     def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
         """Count the copies of a frame as evidence that their links lead to one vehicle."""
         used = choice.used
-        # If the link in use did not deliver the frame, it may come from another vehicle.
+        # If the link in use did not deliver the frame, the frame may come from another vehicle.
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # When the link in use delivers the frame, it counts for all links that delivered it earlier. A copy that
-            # arrives later counts for its own link and the link in use.
+            # A frame that arrives over the link in use counts for all links with an earlier copy. A later copy counts
+            # for its own link and for the link in use.
             is_new = link == used.link or candidate.link in (link, used.link)
             if is_new and self.copies.arrived_over(candidate.link):
                 candidate.record_copy(now)

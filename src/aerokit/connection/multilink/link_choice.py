@@ -204,7 +204,7 @@ class LinkChoice:
         self.candidates: dict[int, Candidate] = {}
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
-        """The vehicle's hardware id, which was received over the link in use at that time."""
+        """The vehicle's hardware id, received over the link that was in use then."""
         # Index of the link that delivered `hardware`, or over which a later reboot was detected; -1 if there is none.
         # The next id over this link replaces `hardware` even if it differs.
         self._hardware_link = -1
@@ -236,8 +236,8 @@ class LinkChoice:
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record a probe's answer. The vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
         candidate = self.candidates[link]
-        # True if the link in use has not answered since the previous answer over this link, whose time
-        # `record_round_trip` replaces below.
+        # True if the link in use has not answered since the previous answer over this link. This is checked before
+        # `record_round_trip` replaces the time of that answer.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:

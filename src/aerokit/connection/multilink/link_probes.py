@@ -93,8 +93,8 @@ class LinkProbes:
         self._pending[ts1] = system_id, candidate.link, now
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
         # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack). The ack of this
-        # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm: no order is a
-        # REQUEST_MESSAGE, and `request_message` waits for the message itself.
+        # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm, because actions use
+        # other commands, and `request_message` waits for the message itself.
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             request = m.CommandLong(
                 system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),

@@ -137,6 +137,6 @@ class HardwareId(NamedTuple):
         return bool(self.uid and other.uid) and self.uid != other.uid
 
     def confirms(self, other: HardwareId) -> bool:
-        """Return True if ``uid2`` or ``uid`` is equal and nothing contradicts."""
+        """Return True if ``uid2`` or ``uid`` is equal, and the ids do not contradict each other."""
         is_same = (any(self.uid2) and self.uid2 == other.uid2) or (bool(self.uid) and self.uid == other.uid)
         return is_same and not self.contradicts(other)

@@ -1,7 +1,8 @@
 """Control of a vehicle that several programs can reach: freshness of datagrams, and the control lease. Sans-IO.
 
 The vehicle side sends numbered beacons. A client stamps each datagram with the number of the last beacon that it
-received, so the vehicle side knows the maximum age. Data delayed by a broken connection has an old number.
+received, so the vehicle side knows the maximum age of the datagram. A datagram that a broken connection has delayed
+has an old number.
 
 Times are seconds on any monotonic clock.
 """
@@ -34,7 +35,7 @@ LEASE_TIMEOUT_S = 5.0
 """The control lease becomes free after this silence of its holder."""
 
 NOTICE_INTERVAL_S = 0.5
-"""Minimum interval of notices about one message type, because set-points may be refused 20 times a second."""
+"""Minimum interval of notices about refused messages of one type, e.g. about set-points that are sent at 20 Hz."""
 
 # Messages that change nothing on the vehicle except its streams. Any client may send them.
 READ_MESSAGES = frozenset(
@@ -214,7 +215,7 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
-        """Count a refused frame. Return a notice of it, or nothing if another was sent a moment ago."""
+        """Count a refused frame. Return a notice, or nothing if one about this message was sent a moment ago."""
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
         # A late command gets no answer, because the client may have sent it again. The client would take an answer to
@@ -272,7 +273,7 @@ def _answer(frame: Frame, message: Message, reason: str) -> bytes:
 BEACON_INTERVAL_S = 0.5
 
 MAX_DELAY_S = 2.0
-"""Datagrams with an older stamp are refused. A client that received no beacon for this time sends nothing."""
+"""Maximum age of a datagram's stamp. A client that received no beacon for this time sends nothing."""
 
 _MAX_NONCES = 256
 
@@ -289,7 +290,7 @@ class FreshnessChecker:
         self.duplicates: int = 0
         """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0  # number of the last beacon
-        # Number and send time of the beacons that datagrams may name in their stamps.
+        # Number and send time of the beacons whose numbers are accepted in stamps.
         self._sent: deque[tuple[int, float]] = deque()
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()  # (client, nonce) → last sequence number
 

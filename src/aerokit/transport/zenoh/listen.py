@@ -252,7 +252,7 @@ class ZenohListen(NetworkLink):
         self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
     def _send_notices(self, client: str, notices: list[RefusalNotice], stamp: Stamp | None) -> None:
-        """Send notices about a datagram with this stamp. None addresses all clients with this name."""
+        """Send notices about a datagram. Without its stamp, all programs with the client's name get them."""
         nonce = None if stamp is None else stamp.nonce
         for notice in notices:
             self._put(self._keys.notices(client), notice.replace(nonce=nonce).encode(), b"")
