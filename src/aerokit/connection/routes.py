@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Whether a frame from another peer continues the stream of the route's owner. None means unknown."""
+    """Comparison of a frame from another peer with the stream of the route's owner. None means unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
