@@ -59,8 +59,8 @@ class Copies:
     def is_copy(self, frame: Frame, link: int, *, may_prove: bool = True) -> bool:
         """Remember a frame. Return True if an equal frame arrived recently, but only over other links.
 
-        The other methods refer to the frame of the latest call. With ``may_prove=False``, :meth:`arrived_over` ignores
-        this copy, because a second sender with the same ids sent it.
+        The other methods refer to the frame of the latest call. With ``may_prove=False``, the frame does not count for
+        :meth:`arrived_over`, because a second sender with the same ids sent it.
         """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
@@ -141,7 +141,7 @@ class _Stream:
     __slots__ = ("acknowledgements", "newest_sequence", "received_at")
 
     def __init__(self, link_count: int) -> None:
-        self.received_at = [-math.inf] * link_count
+        self.received_at = [-math.inf] * link_count  # time of the last frame over each link
         self.newest_sequence = -1  # sequence number of the newest accepted frame; -1 if there is none
         # Acknowledgement's payload → how often each link delivered it since the last switch to another link.
         self.acknowledgements: dict[bytes, list[int]] = {}
@@ -206,7 +206,7 @@ class MergedStreams:
                 candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Return True if a frame that is not a copy is to be delivered."""
+        """Return True if this frame, which is not a copy, is to be delivered."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)

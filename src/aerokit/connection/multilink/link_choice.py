@@ -201,7 +201,7 @@ class LinkChoice:
     def __init__(self, *, needs_proof: bool) -> None:
         self.needs_proof: bool = needs_proof
         """True if an autopilot was received, so that a second link must be proven before it is used."""
-        self.candidates: dict[int, Candidate] = {}
+        self.candidates: dict[int, Candidate] = {}  # by index of the link
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, received over the link that was in use then."""
@@ -212,7 +212,7 @@ class LinkChoice:
         """The link in use; None before the first choice."""
         self.previous: Candidate | None = None
         """The link in use before the last switch. Answers may still arrive over it."""
-        self.changed_at: float = -math.inf
+        self.changed_at: float = -math.inf  # time of the last choice of another link
         self.fresh_after: float = -math.inf
         """Telemetry that arrives before this time may be older than the last telemetry of the previous link."""
         self._better: Candidate | None = None  # link that is better than the link in use, since `_better_since`

@@ -154,7 +154,7 @@ class LinkProbes:
         """Report once that the link seems to lead to another vehicle with the same system id."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
-            self._reported.discard(key)  # It is reported again if the link leads to another vehicle later.
+            self._reported.discard(key)  # If the link leads to another vehicle later, that is reported again.
         elif key not in self._reported:
             self._reported.add(key)
             logger.warning(

@@ -331,7 +331,7 @@ class FreshnessChecker:
 
 
 class DelayEstimator:
-    """Estimates how much longer received data was under way than the fastest data so far.
+    """Estimates by how much received data was slower than the fastest data so far.
 
     The sender's clock may show any time, but must run at the same rate as ours. A delay that was constant from the
     start is not detected.
