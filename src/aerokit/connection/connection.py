@@ -433,7 +433,7 @@ class Connection:
         """Record all sent and received frames to a ``.tlog`` file until the connection is closed.
 
         A file that exists already stays as it is until the first frame is received. It is then renamed to the next free
-        number (``flight.1.tlog``). The recording begins with the frames that were sent until then, at most 1000.
+        number (``flight.1.tlog``). The recording begins with the last frames that were sent until then, at most 1000.
 
         Raises:
             LinkOpenError: the file cannot be written.
