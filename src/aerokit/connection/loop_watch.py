@@ -52,9 +52,9 @@ def loop_clock() -> Callable[[], float]:
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    Data that arrives during a pause is read after the pause. It is unknown when it arrived. Its receive time is
-    therefore the time at which the loop last ran before the pause. A pause shorter than ``CHECK_INTERVAL_S +
-    LATE_THRESHOLD_S`` may not be detected. Data may then be older than its receive time says, by at most the pause.
+    Data that arrives during a pause is read only afterwards, so the time of its arrival is unknown. Its receive time is
+    the time at which the loop last ran before the pause. A pause shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S``
+    may not be detected. Data may then be older than its receive time says, by at most the pause.
 
     ``on_blocked`` gets the maximum length of each pause that delays the timer by more than ``BLOCKED_THRESHOLD_S``.
     ``on_slept`` gets the time that the computer was suspended. ``on_caught_up`` is called when all waiting data has

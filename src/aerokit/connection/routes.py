@@ -305,8 +305,8 @@ class Routes:
         boot_ms = boot_time_ms(frame)
         clock_matches: bool | None = None
         if expected_ms is None:
-            # The owner's clock is unknown. It counts as matching, so that the sequence numbers alone decide. If they
-            # are unknown, too, nothing is proven.
+            # The unknown clock of the owner counts as matching, so that the sequence numbers alone decide. If they are
+            # unknown, too, nothing is proven.
             clock_matches = None if sequence_matches is None else True
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence

@@ -283,7 +283,7 @@ class UdpBroadcast(_UdpLink):
         elif not self._keeps_peers:
             # The receiver does not choose peers, so this link does: `write` sends to this peer instead of broadcasting.
             self.keep_peer(source)
-        # For a receiver that does not keep peers, this link has only one remote end, for which the peer is None.
+        # Without a `PeerKeeper`, this link has only one remote end, so the peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:

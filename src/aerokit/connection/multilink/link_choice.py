@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 # Probes are answered twice a second, so a link counts as dead after this silence.
 PROBED_TIMEOUT_S = 1.0
 
-# A costly link, or a link whose probes are not answered, counts as dead after this silence, in which two heartbeats are
-# missing.
+# A costly link, or a link whose probes are not answered, counts as dead after this silence (two missing heartbeats).
 UNPROBED_TIMEOUT_S = 2.5
 
 # This many consecutive matching clock samples prove that a second link leads to the same vehicle.
@@ -25,7 +24,7 @@ MAX_ANSWERS_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
-# If this many frames were received both over a link and over the link in use, both links lead to the same vehicle.
+# This many frames that arrived over a second link and over the link in use prove that both lead to the same vehicle.
 MIN_COPIES = 3
 
 

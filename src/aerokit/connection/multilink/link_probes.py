@@ -83,8 +83,8 @@ class LinkProbes:
         if not is_attached and not self._consume_budget(now):
             return
         self._probed_at[key] = now
-        # The answer contains `ts1`, which identifies the probe. It is our time in nanoseconds. The last three digits
-        # depend on the system and the link, because several probes may be sent at the same time.
+        # The answer repeats `ts1`, which identifies the probe: our time in nanoseconds. The last three digits depend on
+        # the system and the link, because several probes may be sent at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
         if ts1 <= 0 or ts1 in self._pending:
             return  # The number is invalid, or belongs to another pending probe. The next probe is sent as usual.

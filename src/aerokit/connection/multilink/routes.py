@@ -347,8 +347,8 @@ class MultiLinkRoutes:
             return
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
-            # The link cannot tell for which system the data is, so data for other systems is lost, too, and must be
-            # repeated by their commands and transfers.
+            # The link cannot tell for which system the data is, so data for other systems is discarded, too. Commands
+            # and transfers send it again.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             name = self._link.names[used.link]

@@ -210,7 +210,7 @@ class ZenohConnect(NetworkLink):
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
-        """Send a datagram to the vehicle side. It is dropped while beacons are missing."""
+        """Send a datagram to the vehicle side, or drop it while beacons are missing."""
         stamp = self._tracker.make_stamp(self._now(), mode)
         if stamp is None:
             self._drop(1)

@@ -1,8 +1,7 @@
 """Control of a vehicle that several programs can reach: freshness of datagrams, and the control lease. Sans-IO.
 
 The vehicle side sends numbered beacons. A client stamps each datagram with the number of the last beacon that it
-received, so the vehicle side knows the maximum age of the datagram. A datagram that a broken connection has delayed
-has an old number.
+received. The number shows the maximum age of the datagram: one that a broken connection has delayed has an old number.
 
 Times are seconds on any monotonic clock.
 """

@@ -216,7 +216,7 @@ class ZenohListen(NetworkLink):
         return client
 
     def _remove_silent_client(self) -> None:
-        # A client may have left although zenoh did not report the end of its token. It must not block new clients.
+        # A client may have left although zenoh did not report the end of its token. It must not keep new clients out.
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
