@@ -33,7 +33,7 @@ __all__ = ["Bus", "Detach", "EndSignal", "Overflow", "Sink", "Subscription", "co
 logger: logging.Logger = logging.getLogger("aerokit")
 
 Detach = Callable[[], None]
-"""Function that ends an attachment of a sink. A second call does nothing."""
+"""Function that detaches a sink. A second call does nothing."""
 
 Sink = Callable[[Any], None]
 """Callback for one message, frame or event. The callback must return quickly and cannot await."""
@@ -45,8 +45,8 @@ _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# (kind, all sinks): MESSAGE if every sink takes only the message, FRAME if no sink needs the message decoded, otherwise
-# BOTH.
+# (kind, all sinks). The kind is MESSAGE if every sink takes only the message, FRAME if no sink needs the message
+# decoded, otherwise BOTH.
 _DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
@@ -56,8 +56,8 @@ _HEARTBEAT_ID = 0
 class Bus:
     """Delivers messages and events to the attached sinks, in the order in which they were attached.
 
-    ``wanted`` maps each message id for which a sink is attached to the number of its sinks. It is updated in place, so
-    that a framer that is given this mapping skips all other frames.
+    ``wanted`` has the number of sinks for each message id with at least one sink. It is updated in place. A framer that
+    is given this mapping skips all other frames.
     """
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
@@ -74,7 +74,7 @@ class Bus:
         return self._attach((system_id, message_type.ID), (MESSAGE, sink))
 
     def require_frames(self, *message_types: type[Message]) -> None:
-        """Make the framer return frames of these types even without a sink, for code that inspects every frame."""
+        """Make the framer return frames of these types even if no sink is attached."""
         for message_type in message_types:
             self.attach(message_type, _discard)
 
@@ -95,16 +95,16 @@ class Bus:
     def create_on_first(
         self, message_ids: Iterable[int], create: Callable[[], object], *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
-        """Call ``create()`` when the first of these messages arrives, and before the message is delivered.
+        """Call ``create()`` when the first of these messages arrives, before the message is delivered.
 
-        If ``create()`` raises, it is called again with the next message; otherwise it is called once. Sinks that it
+        If ``create()`` raises, it is called again at the next message; otherwise it is called once. Sinks that it
         attaches get the first message too. Returns a function that cancels the call.
         """
 
         def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
-            detach_all()  # This function is defined further down. No frame arrives until then.
+            detach_all()  # It is defined below, before any frame arrives.
             # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
                 if entry not in entries_before:
@@ -279,7 +279,7 @@ class EndSignal:
 
     def __init__(self) -> None:
         self.error: Exception | None = None
-        """The error that ended the owner, set by the owner before it calls :meth:`notify`; None before that."""
+        """The error that ended the owner; None until then. The owner sets it before it calls :meth:`notify`."""
         self._callbacks: list[EndCallback] = []
 
     def raise_if_ended(self) -> None:
@@ -349,7 +349,7 @@ class Subscription(Generic[ItemT]):
         self._detachers: list[Detach] = []  # functions that end the subscription; empty before the `with` block
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._has_reader = False  # True from when a reader waits until it was resumed; a second reader is refused
+        self._has_reader = False  # True while a task is in `_wait`; a second one is refused
         self._waiter: asyncio.Future[None] | None = None  # wakes the waiting reader; None once it was woken
         self._error: Exception | None = None  # raised in the reader once the queue is empty
         self._closed = False
@@ -414,7 +414,7 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
-        if self._closed:  # An earlier sink of the same delivery has closed this subscription.
+        if self._closed:  # Another callback for this item, called before, has closed the subscription.
             return
         if len(self._queue) < self._capacity:
             self._queue.append(item)

@@ -403,9 +403,9 @@ class _Waiter(_Sink[T]):
         self._future: asyncio.Future[T | None] = self._loop.create_future()
         self._error: BaseException | None = None  # raised by `wait` instead of returning a value
         self._hold_timer: asyncio.TimerHandle | None = None  # runs while the predicate is true for the last value
-        # Last values that differ from the value before, for the time-out error.
+        # The last values without consecutive repetitions, for the time-out error.
         self._seen: deque[T] = deque(maxlen=_MAX_LISTED_VALUES)
-        self._seen_count = 0  # number of values received, equal ones included
+        self._seen_count = 0  # number of values received, with repetitions
 
     async def wait(self, timeout: float | None, description: str) -> T:
         """Return the value that met the condition. Raises OperationTimeout."""

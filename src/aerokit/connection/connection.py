@@ -90,8 +90,8 @@ class Connection:
     ) -> None:
         if not 1 <= source_system <= 255:
             raise InvalidArgument(f"source_system = {source_system} is not allowed: it must be 1 to 255")
-        # 0 is the broadcast id, but DroneKit programs send with it. Answers to it look as if they were for all
-        # components of our system.
+        # 0 is the broadcast id, but DroneKit programs send with it. The vehicle's answers then look as if they were for
+        # all components of our system.
         if not 0 <= source_component <= 255:
             raise InvalidArgument(f"source_component = {source_component} is not allowed: it must be 0 to 255")
         _check_version(mavlink_version)
@@ -158,8 +158,8 @@ class Connection:
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system. A message for all or for an unknown target goes
-        to every peer. With several links, :class:`DuplicateSender` may report that the link in use leads to another
-        vehicle with the same id. Messages to the vehicle are then not sent until another link works.
+        to every peer. With several links, nothing is sent over a link that leads to another vehicle with the same id
+        (:class:`DuplicateSender`).
 
         With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``. The
         message itself is not changed.
@@ -332,7 +332,7 @@ class Connection:
         return self._observers.add_sent(callback)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise InvalidArgument if ``types`` is empty, or an item is no event class or message class of the dialect."""
+        """Raise InvalidArgument if ``types`` is empty, or an item is neither an event nor a message of the dialect."""
         if not types:
             raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
@@ -390,11 +390,10 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Return a probable problem with signatures, for error texts; "" if there is none.
+        """Return a hint for error texts if signatures are probably the problem; otherwise "".
 
-        If this program has a signing key, the problem is that it has refused frames of any sender. Without a key, it
-        is that the last heartbeat of this component was signed; this check needs a ``system_id``. ``component_id`` 0
-        means any component of the system.
+        With a signing key, the hint counts the refused frames of all senders. Without a key, it says that the last
+        heartbeat of this component was signed. ``component_id`` 0 means any component of the system.
         """
         return self._gate.describe(
             heartbeat
@@ -422,7 +421,7 @@ class Connection:
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close the connection because of an internal error of aerokit. Errors raised later have it as their cause."""
+        """Close the connection because of an internal error of aerokit, which becomes the cause of all later errors."""
         if not self.is_open and isinstance(error, AerokitError):
             return  # A background task failed only because the connection was closed before.
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
@@ -434,7 +433,7 @@ class Connection:
         """Record all sent and received frames to a ``.tlog`` file until the connection is closed.
 
         A file that exists already stays as it is until the first frame is received. It is then renamed to the next free
-        number (``flight.1.tlog``), and the recording begins with the frames sent before that, at most the last 1000.
+        number (``flight.1.tlog``). The recording begins with the last frames that were sent until then, at most 1000.
 
         Raises:
             LinkOpenError: the file cannot be written.
@@ -562,7 +561,7 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
-        """Write a frame to the peers that lead to the target of ``message``, or to all peers if it has no target.
+        """Write a frame to the peers of the target of ``message``, or to all peers if it has no target.
 
         With ``to``, the target is the system with this id instead. Returns False if nothing was sent.
         """

@@ -54,8 +54,8 @@ class Recording:
         self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
         self._writer: TlogWriter | None = None  # None while frames wait (see `_waiting`) and after the end
         self._file: BinaryIO | None = None  # the file of the writer
-        # The last MAX_WAITING sent frames, until a frame is received and the existing file is renamed. None if no frame
-        # must wait.
+        # Sent frames that wait until a frame is received, because the existing file is renamed only then. None if
+        # frames need not wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.

@@ -66,10 +66,7 @@ class PeerTable:
         yield from self._unverified.values()
 
     def receive_unverified(self, peer: Peer, data: bytes, now: float) -> tuple[Framer, list[Frame]]:
-        """Process bytes of a sender without a valid frame so far.
-
-        Returns its framer, and the frames to deliver.
-        """
+        """Process bytes from a sender that is not a peer yet. Return its framer, and the frames to deliver."""
         framer = self._unverified.get(peer)
         if framer is None:
             framer = self._add_unverified(peer)
@@ -210,7 +207,7 @@ class FrameReceiver:
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
             if multilink is not None and multilink.is_copy(frame, peer, is_other_peer=is_other_peer):
                 continue
-            # With several links, the check is also made while the gate is open, because it records what was admitted.
+            # With several links, `_is_admitted` is called even if the gate is open, because it records the admission.
             must_check = multilink is not None or not gate.is_open
             if must_check and not self._is_admitted(frame, is_other_peer):
                 continue
@@ -306,7 +303,7 @@ class FrameReceiver:
         if not is_foreign and frame not in framer.late:
             return False
         counters = framer.counters_of(frame)
-        # The counters prove that there are two senders, whichever of them has sent this frame.
+        # The counters show whether there are two senders, not which of them has sent this frame.
         if counters is not None and counters.has_duplicates(frame.received_at):
             self._routes.record_duplicate_sender(frame)
             if is_foreign:

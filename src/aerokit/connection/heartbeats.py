@@ -68,7 +68,7 @@ def discovery_event(
 
 
 BLOCKING_MAX_IDLE_S = 60.0
-"""The heartbeat of a blocking program pauses after this many seconds without a call. Programs rarely sleep longer."""
+"""In the blocking API, heartbeats pause after this many seconds without a call. Programs rarely sleep longer."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -76,12 +76,12 @@ logger: logging.Logger = logging.getLogger("aerokit")
 class OwnHeartbeat(Snapshot):
     """Settings of the HEARTBEAT that aerokit sends at 1 Hz (https://mavlink.io/en/services/heartbeat.html).
 
-    A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program hangs,
-    i.e. when it has called neither aerokit nor ``feed()`` for ``fed_within_s`` seconds (infinity: never).
+    A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program seems to
+    hang, i.e. when it has been inactive for ``fed_within_s`` seconds (infinity: never).
 
-    In :mod:`aerokit.sync` and :mod:`aerokit.dronekit`, ``fed_within_s`` is 60 by default (None), because their event
-    loop runs on a separate thread. In asyncio, it is infinity by default, because a blocked loop sends nothing anyway.
-    If you set a number in asyncio, call ``feed()`` regularly, because other calls do not count there.
+    In :mod:`aerokit.sync` and :mod:`aerokit.dronekit`, each call of aerokit counts as activity, and the default (None)
+    is 60 s. In asyncio, only ``feed()`` counts. The default there is infinity, because a blocked loop sends nothing
+    anyway.
 
     ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18 for a companion computer (ONBOARD_CONTROLLER).
     """
@@ -131,14 +131,14 @@ class HeartbeatWatchdog:
         self._clock, self._publish = clock, publish
         self._paused_at: float | None = None  # None while heartbeats are sent
 
-    def watch(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Pause heartbeats while the program is idle for too long.
+    def watch(self, activity: ActivityMonitor, default_limit_s: float) -> None:
+        """Pause heartbeats while ``activity`` is idle for longer than the settings allow.
 
-        ``fed_within_s`` is the limit if the settings have none.
+        ``default_limit_s`` is the limit if the settings have none.
         """
         self.activity = activity
         if self._limit_s is None:
-            self._limit_s = fed_within_s
+            self._limit_s = default_limit_s
 
     def should_send(self) -> bool:
         idle_s = self.activity.idle_s

@@ -45,16 +45,16 @@ def suspended_s() -> float:
 
 def loop_clock() -> Callable[[], float]:
     loop = asyncio.get_running_loop()
-    # asyncio's own loops have a wrapper around this clock.
+    # asyncio's own loops use this clock, too. Reading it directly is faster.
     return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time
 
 
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    Data that arrives during a pause is read after the pause. It is unknown when it arrived. Its receive time is
-    therefore the time at which the loop last ran before the pause. A pause shorter than ``CHECK_INTERVAL_S +
-    LATE_THRESHOLD_S`` may not be detected. Data may then be older than its receive time says, by at most the pause.
+    Data that arrives during a pause is read only afterwards, so the time of its arrival is unknown. Its receive time is
+    the time at which the loop last ran before the pause. A pause shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S``
+    may not be detected. Data may then be older than its receive time says, by at most the pause.
 
     ``on_blocked`` gets the maximum length of each pause that delays the timer by more than ``BLOCKED_THRESHOLD_S``.
     ``on_slept`` gets the time that the computer was suspended. ``on_caught_up`` is called when all waiting data has
@@ -80,10 +80,10 @@ class LoopWatch:
         self._due = self._ran_at  # when the timer should fire
         self._timer: asyncio.TimerHandle | None = None  # None before start() and after close()
         self.oldest_arrival: float = math.inf
-        """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
+        """Earliest possible receive time of data that is read now; infinite if the data cannot have waited."""
         # The last times at which the computer woke, with the seconds for which it was suspended.
         self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
-        # While data may have waited, `arrival` does not read the clocks before this time, because reading is slow.
+        # While waiting data is read, the next time at which `arrival` checks for a suspension, which is slow.
         self._check_sleep_at = -math.inf
         self._has_read = False  # True if data was read since the last call of `_end_assumption_when_idle`
         self._idle_iterations = 0  # number of consecutive loop iterations in which nothing was read
@@ -160,7 +160,7 @@ class LoopWatch:
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _assume_waiting_data(self) -> float:
-        """Return `oldest_arrival`. If it is infinite, first set it to the time at which the loop last ran."""
+        """Assume that data arrived during the pause, and return its earliest possible receive time."""
         if self.oldest_arrival == math.inf:
             self.oldest_arrival = self._ran_at
             self.late_after = -math.inf

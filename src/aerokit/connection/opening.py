@@ -206,7 +206,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return a key that two links cannot share. None if the system chooses a new port or pty for each link."""
+    """Return a key that is equal for links to the same target. None if the system chooses a new port or pty."""
     if isinstance(target, Link):
         return id(target)
     gets_new_endpoint = (target.kind in ("udpin", "tcpin") and not target.port) or (

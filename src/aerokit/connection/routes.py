@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Evidence that another peer's frame continues the owner's stream, or that it does not. None means unknown."""
+    """Comparison of a frame from another peer with the stream of the route's owner. None means unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
@@ -38,9 +38,8 @@ class Evidence(NamedTuple):
 class RouteClaim:
     """Evidence on whether a component now sends from another peer of the link.
 
-    The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
-    the component claims the route. When the owner sends again, the claim starts anew. Only the sequence number of the
-    claim's first frame is evidence, because a peer could try many numbers until one matches.
+    The owner of a route is the peer to which messages for the component are sent. Another peer that sends with the ids
+    of the component claims the route. When the owner sends again, the claim starts anew.
     """
 
     __slots__ = (
@@ -89,7 +88,8 @@ class RouteClaim:
 
         ``rate`` is the owner's number of frames per second.
         """
-        # The claim must last as long as the owner needs for three frames. A frame of the owner ends it.
+        # The claim must last for the time in which the owner usually sends three frames. Any frame of the owner ends
+        # the claim.
         return (
             self.continues_owner
             and self._frames >= CLAIM_MIN_FRAMES
@@ -148,18 +148,18 @@ class Routes:
 
     The first peer that sends a HEARTBEAT under these ids owns the route. Frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer continues the owner's stream if its sequence numbers and, where known,
-    its time since boot are those expected of the owner. The owner is gone once its TCP client has disconnected, or
-    after 3.5 s without a heartbeat, not counting pauses of the event loop.
+    its time since boot are those expected of the owner. The owner is gone once it has disconnected, or after 3.5 s
+    without a heartbeat, not counting pauses of the event loop.
 
     Another peer takes over the route (``RouteChanged``)
 
-    1. at once, if it is another port of the same host and has continued the stream with three frames, while the owner
-       sent nothing for the time of three frames;
+    1. at once, if it is another port of the same host and has continued the stream with three frames, and the owner has
+       sent nothing for as long as it usually needs for three frames;
     2. when the owner is gone, if the peer is on the same host (as after a reboot), continues the stream, or signs with
        our key;
     3. when the owner is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
 
-    Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
+    A peer that was refused (``RouteChangeRefused``) is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.
 
     ``attached`` has the system ids with a vehicle object. ``boot_clocks[component](received_at)`` returns the expected
@@ -227,15 +227,12 @@ class Routes:
         return peers or EVERY_PEER
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
-        """Return True if the frame came from ``peer``, but messages to its sender are sent to another peer."""
+        """Return True if the frame came from ``peer``, but another peer owns its sender's route."""
         route = self._routes.get((frame.system_id, frame.component_id))
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Record the claim of ``peer`` to the sender's route. Return True if the route was moved to it.
-
-        Refused claims and moves are published.
-        """
+        """Record the claim of ``peer`` to the sender's route. Return True if the peer now owns the route."""
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
@@ -308,8 +305,8 @@ class Routes:
         boot_ms = boot_time_ms(frame)
         clock_matches: bool | None = None
         if expected_ms is None:
-            # The owner's clock is unknown. It counts as matching, so that the sequence numbers alone decide. If they
-            # are unknown, too, nothing is proven.
+            # The unknown clock of the owner counts as matching, so that the sequence numbers alone decide. If they are
+            # unknown, too, nothing is proven.
             clock_matches = None if sequence_matches is None else True
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
@@ -356,7 +353,7 @@ class Routes:
         return len(self._routes) < MAX_ROUTES
 
 
-_SAME_PEER = object()  # stands for the peer in claims of a second sender that sends through the owner's peer
+_SAME_PEER = object()  # used as the peer in claims of a second sender that is received from the owner's peer
 
 
 def _peer_name(peer: Peer) -> str:

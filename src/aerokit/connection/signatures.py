@@ -41,8 +41,8 @@ class SignatureGate:
         self._reported: set[Refusal] = set()  # reasons that were already logged
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True inside the `with` block of key_handover()
-        self._logged_keep_error: OSError | None = None  # None if the file of ``Signing(keep=…)`` could be written
-        # Before the first frame, the owner calls `set_signing`, and this call updates `is_open`.
+        self._logged_keep_error: OSError | None = None  # last logged error of writing the file of ``Signing(keep=…)``
+        # The owner calls `set_signing`, which sets the actual value, before the first frame.
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = lambda: None
@@ -64,8 +64,8 @@ class SignatureGate:
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
         """Switch to ``signing`` when frames of the component show that it uses the new key.
 
-        The old key signs and verifies until the switch, which sets the yielded event. None means that the component
-        stops signing. Raises BusyError if another handover is in progress.
+        Until then, the old key signs and verifies. The switch sets the yielded event. With ``signing=None``, the
+        component is to stop signing. Raises BusyError if another handover is in progress.
         """
         check_signing(signing, self._encoder.version)
         if self._is_handing_over:
@@ -87,7 +87,7 @@ class SignatureGate:
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
         """Return True if a frame may be delivered. A frame with the new key causes the switch of :meth:`key_handover`.
 
-        ``may_hand_over`` is False for a frame from another peer than its component's. Such a frame causes no switch.
+        With ``may_hand_over=False``, it causes no switch, because it came from another peer than the component's.
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
@@ -105,7 +105,7 @@ class SignatureGate:
                 return signing.may_be_unsigned(frame)
             refusal = signing.check(frame, self._unix_time())
         except Exception:  # from `allow_unsigned`, a function of the program; nothing else here or above raises
-            logger.exception("the check of a frame by %r raised; the frame was refused", signing)
+            logger.exception("the check of a frame by %r raised an exception; the frame was refused", signing)
             return False
         if refusal is not None and refusal not in self._reported:
             self._reported.add(refusal)
@@ -136,9 +136,9 @@ class SignatureGate:
         self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Return a probable problem with signatures, for error texts. Empty if there is none.
+        """Return a hint for error texts if signatures are probably the problem. Empty if not.
 
-        With a key, the problem is that frames were refused. Without a key, it is that one of ``heartbeats`` is signed.
+        With a key, the hint counts refused frames. Without a key, it says that one of ``heartbeats`` is signed.
         """
         signing = self._encoder.signing
         if signing is not None:

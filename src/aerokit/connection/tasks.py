@@ -24,8 +24,8 @@ class BackgroundTasks:
     ``task.cancel()``, ``asyncio.timeout`` and ``asyncio.TaskGroup`` behave differently in each version of Python and
     anyio; in some versions, exceptions are lost or exchanged.
 
-    If the program cancels a scope of its own, these tasks continue: heartbeats are sent while a shielded program lands
-    its vehicle.
+    The tasks continue when the program cancels a scope of its own. Heartbeats are therefore sent while shielded code
+    lands the vehicle.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
@@ -37,7 +37,7 @@ class BackgroundTasks:
         return len(self._tasks)
 
     def start(self, function: Callable[[], Awaitable[None]], name: str | None = None) -> asyncio.Task[None] | None:
-        """Run ``function()`` in a new task, and return the task. Return None after :meth:`cancel`.
+        """Run ``function()`` in a new task, and return the task. After :meth:`cancel`, only return None.
 
         A task that is cancelled before its first step never calls the function.
         """

@@ -398,8 +398,8 @@ class Connection(ConnectionTwin):
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system. A message for all or for an unknown target goes
-        to every peer. With several links, :class:`DuplicateSender` may report that the link in use leads to another
-        vehicle with the same id. Messages to the vehicle are then not sent until another link works.
+        to every peer. With several links, nothing is sent over a link that leads to another vehicle with the same id
+        (:class:`DuplicateSender`).
 
         With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``. The
         message itself is not changed.

@@ -50,8 +50,8 @@ class OrderRefusalListener(Receiver, Protocol):
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the other end did not forward a message to the vehicle.
 
-        ``message`` is the name of the message. ``lease_holder`` is the client that has control, if its control is the
-        reason. ``answers`` are the frames by which a vehicle would reject the command; empty if there are none.
+        ``message`` is the name of the message. ``lease_holder`` is the client that has control, if this is why the
+        message was refused. ``answers`` are the frames by which a vehicle would reject the command; they may be empty.
         """
 
 

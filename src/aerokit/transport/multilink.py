@@ -43,7 +43,7 @@ class MemberLinkListener(Receiver, Protocol):
 
 
 class MultiLink(Link):
-    """Several links to the same vehicles. Those that cannot be opened are retried, if at least one can.
+    """Several links to the same vehicles. If at least one can be opened, the others are retried.
 
     Args:
         factories: functions that create the links, called for the first and every later attempt to open them.
@@ -210,7 +210,7 @@ class MultiLink(Link):
         finally:  # The caller may be cancelled again; anyio does so at each await.
             for link in self._own_links:
                 link.close()
-            # A closed link cannot be opened again.
+            # A closed link cannot be opened again, so it is replaced.
             for index, make_link in enumerate(self._factories):
                 if index not in self._foreign:
                     self._links[index] = make_link()

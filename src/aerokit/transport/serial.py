@@ -39,7 +39,7 @@ _READ_SIZE = 4096
 
 _LINGER_STEP_S = 0.005
 
-_MAX_BUFFER_S = 2.0  # The write buffer holds data for this time. Older data would be outdated when it arrives.
+_MAX_BUFFER_S = 2.0  # The write buffer holds as much data as the port sends in this time.
 
 
 class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
@@ -200,16 +200,13 @@ class _SerialProtocol(asyncio.Protocol):
             with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._link._loop.call_soon(self._link._outbox.resume)
 
-    # Our replacements of the transport's methods report their errors themselves. This method gets all other errors.
+    # The methods of `_replace_port_methods` report their errors themselves. This method gets all other errors.
     def connection_lost(self, exc: Exception | None) -> None:
         self._link._lose(f"the device failed: {exc}", exc)
 
 
 def _replace_port_methods(port: Any, on_failure: _OnFailure) -> None:
-    """Replace methods of a port by ones that never block.
-
-    ``on_failure`` is called if the device is lost.
-    """
+    """Replace methods of a port by ones that never block, and that call ``on_failure`` if the device is lost."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), on_failure)

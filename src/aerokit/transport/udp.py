@@ -33,7 +33,7 @@ MAX_PEERS = 256
 """Maximum number of peers if the receiver is not a `PeerKeeper`. A new peer replaces the least recent one."""
 
 REMOTE_TIMEOUT_S = 3.5
-"""After this silence of the peer that answered a broadcast, its address may have changed, so broadcasts start again."""
+"""A `UdpBroadcast` broadcasts again after this silence of its peer, because the peer's address may have changed."""
 
 _MAX_DATAGRAM_BYTES = 65535
 _RECEIVE_BUFFER = 1024 * 1024  # enough for a burst of a log download that arrives while the program is busy
@@ -170,13 +170,12 @@ class UdpListen(_UdpLink):
     def peers(self) -> tuple[Peer, ...]:
         """Remembered peers, newest first.
 
-        They are ordered by their last datagrams or, if the receiver keeps peers, by the time they were added.
+        They are ordered by their last datagrams or, if the receiver is a `PeerKeeper`, by the time they were added.
         """
         return tuple(reversed(self._peers))
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Data for all peers does not count as dropped if there is no peer yet."""
-        if peer is None:
+        if peer is None:  # If there is no peer yet, nothing counts as dropped.
             for known_peer in self._peers:
                 self._send(data, known_peer)
         elif peer in self._peers:
@@ -242,9 +241,9 @@ class UdpConnect(_UdpLink):
 class UdpBroadcast(_UdpLink):
     """``udpbcast:`` link (IPv4): broadcasts until a peer answers, then uses that peer only.
 
-    After 3.5 s of silence it broadcasts again, and accepts another peer. If the receiver keeps peers, another port of
-    the same host is accepted at once. Data for one peer is never broadcast. ``peers`` are the IP addresses and networks
-    to accept; None: all.
+    After 3.5 s of silence it broadcasts again, and accepts another peer. Another port of the same host is accepted at
+    once if the receiver is a `PeerKeeper`. Data for one peer is never broadcast. ``peers`` are the IP addresses and
+    networks to accept; None: all.
     """
 
     _received_at: float  # time of the last datagram from `_remote`; set together with `_remote`
@@ -284,14 +283,14 @@ class UdpBroadcast(_UdpLink):
         elif not self._keeps_peers:
             # The receiver does not choose peers, so this link does: `write` sends to this peer instead of broadcasting.
             self.keep_peer(source)
-        # To a receiver that does not keep peers, this link has a single remote end, so the peer is None.
+        # Without a `PeerKeeper`, this link has only one remote end, so the peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
         """Return True if datagrams of a sender other than the present peer may be delivered."""
         host, *_ = source
-        # Another port of the same host need not wait for silence if the receiver keeps peers: such a receiver checks
-        # the frames before it calls `keep_peer`.
+        # A `PeerKeeper` checks the frames before it calls `keep_peer`. Another port of the same host therefore need not
+        # wait for silence.
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 

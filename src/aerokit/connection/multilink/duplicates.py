@@ -16,11 +16,10 @@ if TYPE_CHECKING:
 
 MAX_REMEMBERED = 4096  # number of remembered frames, enough for 10 s at 400 frames per second
 
-# An equal frame over another link is always a duplicate if it arrives within this time after the first.
+# An equal frame over another link is a copy if it arrives within this time after the first.
 COPY_WINDOW_S = 3.0
 
-# A copy over a slow link may arrive up to this time after the first copy. After COPY_WINDOW_S, an equal frame can
-# only be a duplicate if the first copy was accepted.
+# Over a slow link, a copy of an accepted frame may arrive this late.
 LATE_COPY_WINDOW_S = 10.0
 
 # An equal frame counts as a new frame, not as a copy, if the sender has sent at least this many frames in between.
@@ -36,8 +35,8 @@ class _Seen:
     def __init__(self, at: float, link_bit: int, count: int) -> None:
         self.at = at  # receive time of the first copy
         self.link_bits = link_bit  # has one bit for each link over which the frame arrived
-        self.proving_bits = 0  # the same, without links over which a second sender with the same ids sent it
-        self.count = count  # number of the sender's frames, this one included, when it arrived
+        self.proving_bits = 0  # the same, except links over which a second sender with the same ids sent the frame
+        self.count = count  # number of frames received from the sender until then, this one included
         self.is_admitted = False  # see `Copies.was_admitted`
         self.is_accepted = False  # see `Copies.was_accepted`
 
@@ -60,8 +59,8 @@ class Copies:
     def is_copy(self, frame: Frame, link: int, *, may_prove: bool = True) -> bool:
         """Remember a frame. Return True if an equal frame arrived recently, but only over other links.
 
-        The other members refer to the frame of the latest call. ``may_prove`` is False if a second sender with the
-        same ids sent the frame.
+        The other methods refer to the frame of the latest call. With ``may_prove=False``, the frame does not count for
+        :meth:`arrived_over`, because a second sender with the same ids sent it.
         """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
@@ -142,7 +141,7 @@ class _Stream:
     __slots__ = ("acknowledgements", "newest_sequence", "received_at")
 
     def __init__(self, link_count: int) -> None:
-        self.received_at = [-math.inf] * link_count
+        self.received_at = [-math.inf] * link_count  # time of the last frame over each link
         self.newest_sequence = -1  # sequence number of the newest accepted frame; -1 if there is none
         # Acknowledgement's payload → how often each link delivered it since the last switch to another link.
         self.acknowledgements: dict[bytes, list[int]] = {}
@@ -152,7 +151,7 @@ class _Stream:
         return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
 
     def is_repeated(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement. Return True if another link delivered it at least as often."""
+        """Count an acknowledgement. Return True if another link delivered it at least as often as this link."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for index, count in enumerate(counts) if index != link)
@@ -161,9 +160,9 @@ class _Stream:
 class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
-    Two links to different ports of an autopilot carry separate streams, because each port has its own sequence numbers.
-    A frame over the link that is not in use may then be older than accepted frames. It is accepted only if it is a late
-    answer, or if the link in use does not reach its component. ``choices`` has the links to each system.
+    If the links lead to different ports of an autopilot, their sequence numbers cannot be compared, because each port
+    has its own. Only frames over the link in use are then accepted, apart from late answers and components that this
+    link does not reach. ``choices`` has the links to each system.
     """
 
     def __init__(self, link_count: int, choices: Mapping[int, LinkChoice]) -> None:
@@ -177,15 +176,15 @@ class MergedStreams:
     def was_accepted(self, frame: Frame, link: int, *, may_prove: bool) -> bool:
         """Return True if this frame is a copy of a frame that was accepted over another link.
 
-        The call then records that the frame's link works. ``may_prove`` is False if a second sender with the same ids
-        sent the frame.
+        ``may_prove`` is False if a second sender with the same ids sent the frame. The copy then does not prove that
+        its link leads to the vehicle.
         """
         if not self.copies.is_copy(frame, link, may_prove=may_prove):
             return False
         choice = self._choices.get(frame.system_id)
-        # Equal frames prove that their links lead to one vehicle if they contain the time since boot. Frames without
-        # that time, such as heartbeats, may be equal although they come from two vehicles. Frames that were refused
-        # prove nothing, because any sender can send them over two links.
+        # Equal frames with a time since boot prove that their links lead to one vehicle. Other frames, such as
+        # heartbeats, may be equal although they come from two vehicles. Frames that the signature check refused prove
+        # nothing, because any sender can send them over two links.
         if choice is not None and boot_time_ms(frame) and self.copies.was_admitted:
             self._record_copy(choice, link, frame.received_at)
         if not self.copies.was_accepted:
@@ -196,17 +195,18 @@ class MergedStreams:
     def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
         """Count the copies of a frame as evidence that their links lead to one vehicle."""
         used = choice.used
-        # If the link in use did not deliver the frame, it may come from another vehicle.
+        # If the link in use did not deliver the frame, the frame may come from another vehicle.
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # A copy is evidence only once the link in use has delivered it, too. It then counts for all faster links.
+            # A frame that arrives over the link in use counts for all links with an earlier copy. A later copy counts
+            # for its own link and for the link in use.
             is_new = link == used.link or candidate.link in (link, used.link)
             if is_new and self.copies.arrived_over(candidate.link):
                 candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Decide whether to deliver a frame that is no copy, and record it if so."""
+        """Return True if this frame, which is not a copy, is to be delivered."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)

@@ -13,19 +13,18 @@ if TYPE_CHECKING:
 # Probes are answered twice a second, so a link counts as dead after this silence.
 PROBED_TIMEOUT_S = 1.0
 
-# A costly link, or a link whose probes are not answered, counts as dead after this silence, in which two heartbeats are
-# missing.
+# A costly link, or a link whose probes are not answered, counts as dead after this silence (two missing heartbeats).
 UNPROBED_TIMEOUT_S = 2.5
 
 # This many consecutive matching clock samples prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
-# After this many answers to TIMESYNC probes, an answer to an earlier request for the hardware id is no longer expected.
+# A request for the hardware id counts as unanswered after this many later answers to TIMESYNC probes.
 MAX_ANSWERS_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
-# If this many frames were received both over a link and over the link in use, both links lead to the same vehicle.
+# This many frames that arrived over a second link and over the link in use prove that both lead to the same vehicle.
 MIN_COPIES = 3
 
 
@@ -36,7 +35,7 @@ class Candidate:
         self.link = link
         self.is_costly = is_costly
         self.received_at: float = now
-        """Time of the last frame of the system over the link, up to an interval of `record_counts` (0.1 s) too late."""
+        """Time of the last frame received from the system over the link. May be 0.1 s too late."""
         self.answered_at: float = -math.inf
         """Time of the last answer to a probe."""
         self.shared_at: float = -math.inf
@@ -46,7 +45,7 @@ class Candidate:
         self.is_stalled: bool = False
         """True while written data stays in this machine's buffers."""
         self.loss: float | None = None
-        """Fraction of frames lost, mostly of the last dozen frames, 0 to 1; None if unknown. A silence keeps it."""
+        """Fraction of frames lost, 0 to 1, mostly of the last dozen frames. None if unknown."""
         self.round_trip_s: float | None = None
         """Smoothed round-trip time of the probes; None before the first answer."""
         self.is_proven: bool = False
@@ -58,7 +57,7 @@ class Candidate:
         self.hardware: HardwareId | None = None
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
-        """True if :attr:`hardware` is another vehicle's. The link is then not proven by its clock or by copies."""
+        """True if :attr:`hardware` is another vehicle's id. A matching clock or copies then prove nothing."""
         # Numbers of requests for the hardware id, and of TIMESYNC answers since the first request.
         self._hardware_requests = self._answers_since_request = 0
         # Numbers of consecutive matches and mismatches of the clock, and of copies since the proof was last reset.
@@ -69,7 +68,7 @@ class Candidate:
         received_before, lost_before = self._last_counts
         self._last_counts = received, lost
         if received > received_before:
-            self.received_at = now
+            self.received_at = now  # The frame arrived after the previous call, up to 0.1 s ago.
         # A total is smaller than before if its counters were replaced, e.g. because a peer was evicted.
         new_received, new_lost = max(0, received - received_before), max(0, lost - lost_before)
         if new_received or new_lost:
@@ -86,7 +85,7 @@ class Candidate:
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        ``may_prove`` is False while an answer with the hardware id is expected.
+        With ``may_prove=False``, matches do not prove the link yet, because its hardware id is still awaited.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
@@ -201,18 +200,18 @@ class LinkChoice:
     def __init__(self, *, needs_proof: bool) -> None:
         self.needs_proof: bool = needs_proof
         """True if an autopilot was received, so that a second link must be proven before it is used."""
-        self.candidates: dict[int, Candidate] = {}
+        self.candidates: dict[int, Candidate] = {}  # by index of the link
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
-        """The vehicle's hardware id, which was received over the link in use at that time."""
-        # Index of the link whose next id replaces `hardware` even if it differs; -1 if there is none. This link has
-        # delivered `hardware`, or has shown that the vehicle rebooted.
+        """The vehicle's hardware id, received over the link that was in use then."""
+        # Index of the link that delivered `hardware`, or over which a later reboot was detected; -1 if there is none.
+        # The next id over this link replaces `hardware` even if it differs.
         self._hardware_link = -1
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
         self.previous: Candidate | None = None
         """The link in use before the last switch. Answers may still arrive over it."""
-        self.changed_at: float = -math.inf
+        self.changed_at: float = -math.inf  # time of the last choice of another link
         self.fresh_after: float = -math.inf
         """Telemetry that arrives before this time may be older than the last telemetry of the previous link."""
         self._better: Candidate | None = None  # link that is better than the link in use, since `_better_since`
@@ -236,8 +235,8 @@ class LinkChoice:
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record a probe's answer. The vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
         candidate = self.candidates[link]
-        # True if the link in use has not answered since the previous answer over this link. `record_round_trip` changes
-        # this time, so it is called afterwards.
+        # True if the link in use has not answered since the previous answer over this link. This is checked before
+        # `record_round_trip` replaces the time of that answer.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
@@ -330,7 +329,7 @@ class LinkChoice:
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return
-        # An id that contradicts the id from another link is not adopted: the link in use leads to another vehicle.
+        # If the id contradicts the vehicle's id, which came over another link, this link leads to another vehicle.
         is_from_same_link = self._hardware_link == used.link
         if self.hardware is None or is_from_same_link or not self.hardware.contradicts(hardware):
             self.hardware, self._hardware_link = hardware, used.link
@@ -347,8 +346,8 @@ class LinkChoice:
             # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
             self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
-            # The chosen link was proven by comparison with the previous one (see `may_be_used`), so both lead to one
-            # vehicle. Only a hardware id can disprove this, because the clock of a link in use is not compared.
+            # The chosen link was proven by comparison with the previous one (see `may_be_used`). Both therefore lead
+            # to the same vehicle, unless their hardware ids differ.
             previous.is_proven = not previous.is_other_hardware
         self.previous = previous
         self.used = chosen

@@ -40,8 +40,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, or every five seconds if the link is costly and not in use.
 
-    Answers are recorded in ``choices``. A link to a second vehicle with the same system id is reported once. It is
-    reported again if it has led to the known vehicle in between. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A link that leads to another vehicle with the same system id is reported.
+    ``send(message, peer)`` sends a probe.
     """
 
     def __init__(
@@ -83,8 +83,8 @@ class LinkProbes:
         if not is_attached and not self._consume_budget(now):
             return
         self._probed_at[key] = now
-        # The answer contains `ts1`, which identifies the probe. It is our time in nanoseconds. The last three digits
-        # depend on the system and the link, because several probes may be sent at the same time.
+        # The answer repeats `ts1`, which identifies the probe: our time in nanoseconds. The last three digits depend on
+        # the system and the link, because several probes may be sent at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
         if ts1 <= 0 or ts1 in self._pending:
             return  # The number is invalid, or belongs to another pending probe. The next probe is sent as usual.
@@ -93,8 +93,8 @@ class LinkProbes:
         self._pending[ts1] = system_id, candidate.link, now
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
         # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack). The ack of this
-        # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm: no order is a
-        # REQUEST_MESSAGE, and `request_message` waits for the message itself.
+        # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm, because actions use
+        # other commands, and `request_message` waits for the message itself.
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             request = m.CommandLong(
                 system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
@@ -105,7 +105,7 @@ class LinkProbes:
     def is_answer(self, frame: Frame, link: int) -> bool:
         """Return True if this TIMESYNC answers one of our probes over any link.
 
-        The call records an answer of the autopilot that arrived over the link of its probe.
+        The call records the answer if the autopilot sent it over the link of the probe.
         """
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
@@ -154,7 +154,7 @@ class LinkProbes:
         """Report once that the link seems to lead to another vehicle with the same system id."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
-            self._reported.discard(key)
+            self._reported.discard(key)  # If the link leads to another vehicle later, that is reported again.
         elif key not in self._reported:
             self._reported.add(key)
             logger.warning(

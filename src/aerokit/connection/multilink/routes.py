@@ -199,10 +199,7 @@ class MultiLinkRoutes:
         return None
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers that get a message for this component.
-
-        The call may change the link in use, and records the time of a command. A raw frame (None) counts as a command.
-        """
+        """Return the peers to which a message for a component is sent. The call may change the link in use."""
         if system_id != 0:
             choice = self._choices.get(system_id)
             if choice is None or choice.used is None:
@@ -211,7 +208,7 @@ class MultiLinkRoutes:
             self._choose(system_id, choice, now)
             if choice.used.is_other_hardware:
                 return ()  # The link leads to another vehicle, which DuplicateSender has reported. Nothing is sent.
-            if message is None or message.ID in COMMANDS:
+            if message is None or message.ID in COMMANDS:  # None is a raw frame, which may be a command.
                 choice.record_command(now)
             return self._peers_on(self._link_reaching(choice, (system_id, component_id)), system_id, component_id)
         if message is not None and message.ID in BROADCASTS:
@@ -350,8 +347,8 @@ class MultiLinkRoutes:
             return
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
-            # The link cannot tell for which system the data is, so data for other systems is lost, too. Their commands
-            # and transfers repeat it like any other lost data.
+            # The link cannot tell for which system the data is, so data for other systems is discarded, too. Commands
+            # and transfers send it again.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             name = self._link.names[used.link]

@@ -26,7 +26,10 @@ SPEED_MAX_AGE_S = 5.0  # A clock rate measured before a pause or reboot remains 
 
 
 class VehicleClock:
-    """Estimates the clock of one vehicle from samples: ``vehicle_s`` is its time at our time ``at``, in seconds."""
+    """Estimates the clock of one vehicle from samples.
+
+    In each sample, the vehicle's clock showed ``vehicle_s`` when ours showed ``at``, in seconds.
+    """
 
     def __init__(self) -> None:
         # (our time, the vehicle's time) in seconds.
@@ -71,7 +74,7 @@ class VehicleClock:
         advance_s = vehicle_s - last_vehicle_s
         rate = self._measured_rate
         if rate is None:
-            # The rate of the vehicle's clock is not measured yet. A simulation may run up to MAX_SPEED times as fast.
+            # The rate of the vehicle's clock is not measured yet. In a simulation, it may be up to MAX_SPEED.
             max_advance_s = MAX_SPEED * (at - last_at + MIN_TOLERANCE_S + round_trip_s)
             return -MIN_TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
         tolerance_s = self._tolerance_s(at, round_trip_s, rate)
@@ -134,6 +137,6 @@ class HardwareId(NamedTuple):
         return bool(self.uid and other.uid) and self.uid != other.uid
 
     def confirms(self, other: HardwareId) -> bool:
-        """Return True if ``uid2`` or ``uid`` is equal and nothing contradicts."""
+        """Return True if ``uid2`` or ``uid`` is equal, and the ids do not contradict each other."""
         is_same = (any(self.uid2) and self.uid2 == other.uid2) or (bool(self.uid) and self.uid == other.uid)
         return is_same and not self.contradicts(other)

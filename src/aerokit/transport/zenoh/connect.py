@@ -82,7 +82,7 @@ class ZenohConnect(NetworkLink):
         self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
-        # True while control must be requested, which ends when a beacon shows that this client has it.
+        # With control="take", True until a beacon shows that this client has control.
         self._takes_control = control == "take"
         self._nonce = random.getrandbits(32)  # distinguishes this link from others that use the same client name
         self._tracker = VehicleSideTracker(self._nonce, "never" if control == "never" else "free")
@@ -183,8 +183,8 @@ class ZenohConnect(NetworkLink):
         self._first_beacon.set()
         if self._takes_control:
             self._takes_control = beacon.lease_holder != self.client
-            # An empty datagram with mode "take" requests control. Once this client holds the control lease, one more is
-            # sent with its usual mode.
+            # An empty datagram with mode "take" requests control. Once this client has control, a last one is sent with
+            # the usual mode.
             self._put(b"", self._requested_mode())
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
@@ -210,7 +210,7 @@ class ZenohConnect(NetworkLink):
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
-        """Send a datagram to the vehicle side. It is dropped while beacons are missing."""
+        """Send a datagram to the vehicle side, or drop it while beacons are missing."""
         stamp = self._tracker.make_stamp(self._now(), mode)
         if stamp is None:
             self._drop(1)

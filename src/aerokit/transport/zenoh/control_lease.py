@@ -1,7 +1,7 @@
 """Control of a vehicle that several programs can reach: freshness of datagrams, and the control lease. Sans-IO.
 
 The vehicle side sends numbered beacons. A client stamps each datagram with the number of the last beacon that it
-received, so the vehicle side knows the maximum age. Data delayed by a broken connection has an old number.
+received. The number shows the maximum age of the datagram: one that a broken connection has delayed has an old number.
 
 Times are seconds on any monotonic clock.
 """
@@ -34,7 +34,7 @@ LEASE_TIMEOUT_S = 5.0
 """The control lease becomes free after this silence of its holder."""
 
 NOTICE_INTERVAL_S = 0.5
-"""Minimum interval of notices about one message type, because set-points may be refused 20 times a second."""
+"""Minimum interval of notices about refused messages of one type, e.g. about set-points that are sent at 20 Hz."""
 
 # Messages that change nothing on the vehicle except its streams. Any client may send them.
 READ_MESSAGES = frozenset(
@@ -94,7 +94,7 @@ def is_read_only(frame: Frame) -> bool:
 
 
 def rejection_frames(answer: bytes) -> tuple[bytes, ...]:
-    """Return the frames of a notice's ``answer`` that reject a command."""
+    """Split the bytes of `RefusalNotice.answer` into frames, and return those that reject a command."""
     return tuple(frame.raw for frame in Framer().receive(answer) if _is_rejection(_decoded(frame)))
 
 
@@ -214,7 +214,7 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
-        """Count a refused frame. Return a notice of it, or nothing if another was sent a moment ago."""
+        """Count a refused frame. Return a notice, or nothing if one about this message was sent a moment ago."""
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
         # A late command gets no answer, because the client may have sent it again. The client would take an answer to
@@ -272,7 +272,7 @@ def _answer(frame: Frame, message: Message, reason: str) -> bytes:
 BEACON_INTERVAL_S = 0.5
 
 MAX_DELAY_S = 2.0
-"""Datagrams with an older stamp are refused. A client that received no beacon for this time sends nothing."""
+"""Maximum age of a datagram's stamp. A client that received no beacon for this time sends nothing."""
 
 _MAX_NONCES = 256
 
@@ -289,7 +289,7 @@ class FreshnessChecker:
         self.duplicates: int = 0
         """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0  # number of the last beacon
-        # Number and send time of the beacons that datagrams may name in their stamps.
+        # Number and send time of the beacons whose numbers are accepted in stamps.
         self._sent: deque[tuple[int, float]] = deque()
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()  # (client, nonce) → last sequence number
 
@@ -330,13 +330,14 @@ class FreshnessChecker:
 
 
 class DelayEstimator:
-    """Estimates the delay of received data, relative to the smallest delay so far, which counts as zero.
+    """Estimates by how much received data was slower than the fastest data so far.
 
-    The clocks need the same rate, not the same time. A constant delay from the start is not detected.
+    The sender's clock may show any time, but must run at the same rate as ours. A delay that was constant from the
+    start is not detected.
     """
 
     def __init__(self) -> None:
-        self._min_offset: float | None = None  # smallest difference so far of our time and the sender's send time
+        self._min_offset: float | None = None  # smallest difference so far between receive time and send time
         self._measured_at = 0.0  # time at which `_min_offset` was measured
 
     def delay(self, sent_s: float, now: float) -> float:
@@ -355,7 +356,7 @@ class DelayEstimator:
 
 
 class VehicleSideTracker:
-    """Tracks a vehicle's end of the link by its beacons, and creates the stamps of datagrams. Used by clients."""
+    """Used by clients: tracks the vehicle side, i.e. the program that serves the vehicle, and stamps datagrams."""
 
     def __init__(self, nonce: int, mode: ControlMode = "free") -> None:
         self.epoch: int | None = None
@@ -377,7 +378,6 @@ class VehicleSideTracker:
         """Record a beacon. Return False for a beacon that is ignored.
 
         A beacon is ignored if it is late, if a newer one was already received, or if another vehicle side has sent it.
-        A vehicle side is a program that serves the vehicle to clients.
         """
         if beacon.epoch != self.epoch:
             if self.epoch is not None and not self.is_silent(now):
@@ -399,7 +399,7 @@ class VehicleSideTracker:
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
         """Return True if a datagram is on time and from the tracked vehicle side.
 
-        A vehicle side is a program that serves the vehicle to clients. ``sent_s`` is the send time on its clock.
+        ``sent_s`` is the send time on the vehicle side's clock.
         """
         if epoch != self.epoch:
             self.foreign += 1

@@ -153,7 +153,7 @@ class RefusalNotice(Snapshot):
     reason: str
     """Text that explains the refusal."""
     lease_holder: str | None = None
-    """Client that has control, if its control is the reason."""
+    """Client that has control, if this is why the command was refused; otherwise None."""
     answer: bytes = b""
     """Frames by which a vehicle would reject the command: COMMAND_ACK or MISSION_ACK, and STATUSTEXT."""
     count: int = 1

@@ -49,8 +49,8 @@ logger: logging.Logger = logging.getLogger("aerokit")
 class ZenohListen(NetworkLink):
     """``zenohin:`` link: serves the clients (`ZenohConnect`) that use its name. Each client is a peer.
 
-    The link is not lost when clients or the network fail. Outdated datagrams, and commands while another client has
-    control, are refused and counted, and the client is notified.
+    The link is not lost when clients or the network fail. Outdated datagrams are refused, and so are commands while
+    another client has control. Refused frames are counted, and the client is notified.
 
     Args:
         fleet: name of the fleet, up to 63 letters, digits, ``_``, ``.`` and ``-``.
@@ -72,7 +72,7 @@ class ZenohListen(NetworkLink):
         self._zenoh: Any = None  # the imported module; None before the opening
         self._publisher: Any = None  # sends to all clients; None while the link is not open
         self._may_have_rival = False  # True if a liveliness token shows that the name may be in use
-        self._is_serving = False  # True from the end of the opening on
+        self._is_serving = False  # True while clients are served
         self._rival_found = asyncio.Event()  # set when another vehicle side sends a beacon under this name
         self._beacon_at = 0.0  # time of the last own beacon
 
@@ -124,15 +124,12 @@ class ZenohListen(NetworkLink):
                 # After a time-out, the block ends in the line above. This line is reached only if a beacon arrived.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         with zenoh_errors(self.address, self._zenoh):
-            await open_in_thread(partial(self._serve, queue, session), _nothing)
+            await open_in_thread(partial(self._serve, queue, session))
         self._is_serving = True
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
-        """Find out whether the name may be in use, and subscribe to beacons.
-
-        Runs on a thread of the executor.
-        """
+        """Subscribe to beacons, and check whether the name may be in use. Runs on a thread of the executor."""
 
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
@@ -213,13 +210,13 @@ class ZenohListen(NetworkLink):
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
         if client is None and len(self._clients) < MAX_CLIENTS:
-            with contextlib.suppress(InvalidArgument):  # A client of aerokit never has a name that is not allowed.
+            with contextlib.suppress(InvalidArgument):  # A program other than aerokit may use a wrong name.
                 client = self._clients[name] = ClientFilter(check_name("client", name), self._lease)
                 client.received_at = self._now()
         return client
 
     def _remove_silent_client(self) -> None:
-        # A client may have left although zenoh did not report the end of its token. It must not block new clients.
+        # A client may have left although zenoh did not report the end of its token. It must not keep new clients out.
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
@@ -255,7 +252,7 @@ class ZenohListen(NetworkLink):
         self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
     def _send_notices(self, client: str, notices: list[RefusalNotice], stamp: Stamp | None) -> None:
-        """Send notices about a datagram with this stamp. None addresses all clients with this name."""
+        """Send notices about a datagram. Without its stamp, all programs with the client's name get them."""
         nonce = None if stamp is None else stamp.nonce
         for notice in notices:
             self._put(self._keys.notices(client), notice.replace(nonce=nonce).encode(), b"")
@@ -271,10 +268,6 @@ class ZenohListen(NetworkLink):
             put()
         except Exception:  # zenoh raises various errors after its session has ended.
             self._drop(1)
-
-
-def _nothing(_: object) -> None:
-    pass
 
 
 def _client_of(sample: Any) -> str:

@@ -75,7 +75,7 @@ class LoopQueue:
         self._loop.call_soon(self._drain)
 
 
-async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object]) -> ItemT:
+async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object] = lambda _: None) -> ItemT:
     """Run ``work()`` in a thread and return what it opens.
 
     A thread cannot be stopped. After a cancellation, the result is passed to ``close`` as soon as it is available.
@@ -164,7 +164,7 @@ class NetworkLink(BaseLink):
 
 
 async def open_session(address: str, options: NetworkOptions, declare: Callable[[Any, Any], object]) -> Any:
-    """Open a session, and call ``declare(zenoh, session)`` in the same thread, where declarations may block.
+    """Open a session in a thread, and call ``declare(zenoh, session)`` there, because declarations may block.
 
     Raises:
         LinkOpenError: zenoh is not installed, or the session could not be opened.
@@ -183,7 +183,7 @@ async def open_session(address: str, options: NetworkOptions, declare: Callable[
         return session
 
     with zenoh_errors(address, zenoh):
-        return await open_in_thread(work, lambda session: close_session(session, _nothing))
+        return await open_in_thread(work, close_session)
 
 
 @contextlib.contextmanager
@@ -195,7 +195,7 @@ def zenoh_errors(address: str, zenoh: Any) -> Iterator[None]:
         raise LinkOpenError(f"cannot open {address}: {_reason(error)}") from None
 
 
-def close_session(session: Any, closed: Callable[[], object]) -> None:
+def close_session(session: Any, closed: Callable[[], object] = lambda: None) -> None:
     """Close a session on a thread, and then call ``closed()``."""
 
     def work() -> None:
@@ -259,7 +259,3 @@ def _reason(error: Exception) -> str:
         endpoints = ", ".join(_ENDPOINTS.findall(text)) or text
         return f"cannot connect to {endpoints} (is a router or peer running there, and is this its address?)"
     return text.replace(": [", ": ")
-
-
-def _nothing() -> None:
-    pass
