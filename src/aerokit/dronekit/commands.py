@@ -214,8 +214,8 @@ class CommandSequence:
         """Append a copy of a command; :meth:`upload` sends the change. Waits for a running download.
 
         ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` is set. If
-        the sequence is empty and ``cmd`` has the form of the home row that begins a waypoint file, it is stored as home
-        instead of being appended. Raises APIException if the last download has failed.
+        the sequence is empty, a command that looks like the home row of a waypoint file is stored as home instead.
+        Raises APIException if the last download has failed.
         """
         self._require_downloaded()
         added = _command_from(cmd)

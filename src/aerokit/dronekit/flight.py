@@ -134,8 +134,8 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # If an opposite order was overruled, HEARTBEAT may still report the state from before that order. In
-                # this case, `_armed` is reliable only after `order` is done.
+                # After an opposite order, HEARTBEAT may still report the state from before both orders, so `order` must
+                # be done, too.
                 return self._dk_reports_armed(value) and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
@@ -333,7 +333,7 @@ class FlightMethods(VehicleAttributes):
         self.wait_for(has_reached, timeout, errmsg="failed to reach specified altitude")
 
     def _dk_altitude_condition(self, alt: float, epsilon: float, *, is_relative: bool) -> Callable[[], bool]:
-        """Return a function that is true once the altitude is near ``alt``, or has passed it since the first call."""
+        """Return a function: True if the altitude is near ``alt``, or has passed ``alt`` since the first call."""
         start: float | None = None
 
         def has_reached() -> bool:

@@ -71,8 +71,8 @@ class Gimbal(GimbalPrivates):
 
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
-            roll: degrees from the horizon. A roll other than 0 is sent by MAVLink's older mount command. The camera
-                then points at ``yaw`` at first, but turns with the vehicle afterwards.
+            roll: degrees from the horizon. With a roll other than 0, the camera points at ``yaw`` only at first, and
+                then turns with the vehicle, because MAVLink's older mount command is sent.
             yaw: degrees clockwise from north.
         """
         pitch = _checked("pitch", pitch)

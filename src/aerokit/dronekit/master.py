@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
-# Messages are stored from the first access on. For this time after the first access, a look-up waits for a message that
-# has not arrived yet.
+# Messages are stored from the first access on. A look-up within this time after it waits until the message arrives.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
 
@@ -257,8 +256,8 @@ class Master:
 class Inbox(Mapping[str, Any]):
     """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    Reception starts with the first access. Look-ups in the first second after that wait for their message. Messages of
-    radios and ground stations are included, but not those of other vehicles.
+    Messages are stored from the first access on. A look-up in the first second waits until the message arrives.
+    Messages of radios and ground stations are included, but not those of other vehicles.
     """
 
     def __init__(self, connection: ClassicConnection) -> None:
@@ -281,7 +280,7 @@ class Inbox(Mapping[str, Any]):
         return None
 
     def age_s(self, name: str) -> float:
-        """Return the seconds since the last message of this type or, before the first, since the first use."""
+        """Return the seconds since the last message of this type, or since the first access if there was none."""
         self._start()
         frame = self._latest.get(_id_of(name))
         if frame is None:
@@ -292,7 +291,7 @@ class Inbox(Mapping[str, Any]):
         self._start()
         message_id = _id_of(name)
         while (frame := self._latest.get(message_id)) is None and self._may_wait():
-            self._arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # It is short, so that `_may_wait` ends the loop in time.
+            self._arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # short, so that `_may_wait` ends the loop in time
         if frame is None:
             raise KeyError(name)
         return message_of(frame)

@@ -36,9 +36,9 @@ _registration_lock = threading.Lock()  # shared by all objects, for adding and r
 class Listeners:
     """The listeners of an object, by the name of the attribute or message. Can be used from any thread.
 
-    Listeners run on the listener thread, in the order of the values. For each value, the listeners of its name run
-    before those of ``'*'``. Listeners may block, raise exceptions and remove themselves. Without a listener thread they
-    run on the notifying thread. ``on_value(name)`` is called for every value, with or without listeners.
+    Listeners run one after the other on the listener thread or, without one, on the notifying thread. The listeners of
+    a name run before those of ``'*'``. Listeners may block, raise exceptions and remove themselves. ``on_value(name)``
+    is called for every value, with or without listeners.
     """
 
     kind = "attribute"  # the word for a name in log messages
@@ -100,7 +100,7 @@ class Listeners:
             self._thread.post_or_drop(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """Like :meth:`notify` with the owner's attribute, which is read only if it has listeners."""
+        """Call the listeners with the value of the owner's attribute. Without listeners, it is not read."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:
@@ -157,7 +157,7 @@ class HasObservers:
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Remove a listener. Ignored if the name has no listeners; ValueError if it has only others."""
+        """Remove a listener. ValueError if it is not one of the name's listeners; ignored if there are none."""
         self._dk_listeners.remove(self._dk_normalized(attr_name), observer)
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:

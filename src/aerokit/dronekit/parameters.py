@@ -39,8 +39,8 @@ VERSION_TIMEOUT_S = 1.0
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-# An attempt to set a parameter takes ROUND_TRIPS round trips of the link, at least MIN_ATTEMPT_S. After the last
-# attempt, the answer is awaited for LAST_WAIT_SHARE of an attempt's time.
+# An attempt to set a parameter may take ROUND_TRIPS round trips of the link, but at least MIN_ATTEMPT_S. For the last
+# attempt, this time is multiplied by LAST_WAIT_SHARE.
 MIN_ATTEMPT_S, ROUND_TRIPS = 1.0, 3
 LAST_WAIT_SHARE = 0.5
 
@@ -76,7 +76,7 @@ class ParameterDownload:
     async def wait_for(self, name: str) -> None:
         """Wait until the parameter is received, or reported as missing by the vehicle.
 
-        Also returns if a vehicle that has sent the list does not answer, or if the connection ends.
+        Also returns if the connection ends, or if the vehicle does not answer after a complete download.
         """
         # A vehicle may leave a parameter out of the list, so it is requested once.
         if self.is_complete:
@@ -352,7 +352,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return attr_name.upper()
 
     def _find(self, name: object, *, waits: bool = True) -> ResolvedParameter | None:
-        """Look up a parameter by name. With ``waits``, request it if it may still be unknown."""
+        """Look up a parameter by name. With ``waits``, request a missing one, unless all were received."""
         if not isinstance(name, str):
             return None
         name = name.upper()

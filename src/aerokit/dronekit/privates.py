@@ -51,7 +51,7 @@ def _velocity(index: int) -> OverridableProperty[Any]:
 
 
 def _message_fields(latest_message: str, *fields: str) -> tuple[OverridableProperty[Any], ...]:
-    """Return properties for fields of the vehicle's LatestMessage with this name."""
+    """Return properties for message fields. ``latest_message`` names an attribute that is a `LatestMessage`."""
     return tuple(attribute_path(f"{latest_message}.message.{field}") for field in fields)
 
 

@@ -260,7 +260,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving, in the loop iteration in which the vehicle was found."""
+        """Start receiving. Called on the loop as soon as the vehicle is found, so that no message is missed."""
         core = self._dk
         core.start_receiving(aio, tasks)
         self._handler.vehicle = self
@@ -324,7 +324,7 @@ async def _connected(
             # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
             rate_hz = min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0
         try:
-            # `begin` is a weak callback, because the loop keeps it until the connection ends.
+            # `begin` is a weak callback, so that this coroutine does not keep the vehicle alive.
             begin(aio, tasks)
             with nullcontext() if rate_hz is None else aio.streams(rate_hz):
                 yield aio

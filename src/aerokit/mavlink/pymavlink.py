@@ -211,11 +211,12 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
     Args:
         frame: a received frame: ``message.received_frame``, or the argument of a frame observer.
-        dialect: pymavlink module that is tried first, if it is for MAVLink 2. Then pymavlink's ardupilotmega and
-            development for MAVLink 2 are tried. The first module that has the message decodes it, with its extension
-            fields. A module that contradicts the CRC_EXTRA of a standard message is skipped. If no module has the
-            message, or the checksum is wrong, the result is a ``MAVLink_unknown`` with type ``UNKNOWN_<id>``.
+        dialect: pymavlink module for MAVLink 2, which is tried before pymavlink's ardupilotmega and development. The
+            first module that has the message decodes it. Modules with another CRC_EXTRA than the standard are skipped.
         timestamp: ``_timestamp`` of the message: in pymavlink, seconds since 1970.
+
+    Returns:
+        The message. If no module has it, or its checksum is wrong: a ``MAVLink_unknown`` of type ``UNKNOWN_<id>``.
     """
     return _decoder(frame.message_id, dialect)(frame, timestamp)
 

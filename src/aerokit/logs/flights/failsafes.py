@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe, or a warning: evidence of a problem without a reaction that is certainly the autopilot's."""
+    """A failsafe or, if ``acted`` is False, a warning: a problem without a certain reaction of the autopilot."""
 
     time_s: float
     kind: str

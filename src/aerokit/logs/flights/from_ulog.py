@@ -203,7 +203,7 @@ class _Reader:
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return number and data of each instance of the first of these topics that the log has."""
+        """Return the numbered instances of the first topic in ``names`` that the log has."""
         for name in names:
             instances = [data for data in self._data if data.name == name]
             if instances:

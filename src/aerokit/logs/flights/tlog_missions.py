@@ -60,7 +60,7 @@ class RecordedMission:
                 if message.type == MavMissionResult.ACCEPTED:
                     self._items.clear()
         elif isinstance(message, m.MissionCount):  # Items beyond this number belong to an earlier mission.
-            self._is_clearing = False  # The next MISSION_ACK confirms the transfer that begins here.
+            self._is_clearing = False  # The next MISSION_ACK is about this transfer, not about clearing.
             self._items = {number: item for number, item in self._items.items() if number < message.count}
         elif message.current not in _NO_MISSION_ITEM:
             self._add(message)

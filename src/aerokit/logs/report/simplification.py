@@ -24,10 +24,10 @@ def simplify(
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. It
-            is exceeded only by points that are always selected: those of ``keep``, those next to a gap, the first, the
-            last, and every 1024th point.
-        tolerance: maximum distance of an omitted point from the line through the selected points.
+        max_points: maximum number of selected points. Some are always selected, even beyond it: those of ``keep``,
+            those next to a gap, the first, the last, and every 1024th point.
+        tolerance: maximum distance of an omitted point from the line through the selected points. The distance may be
+            larger if ``max_points`` is reached.
         keep: indices that are selected if their coordinates are known.
 
     Returns:
