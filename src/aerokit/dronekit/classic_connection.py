@@ -164,7 +164,7 @@ class BackgroundCall(concurrent.futures.Future[None]):
         self.task: asyncio.Task[None] | None = None
 
     def done(self) -> bool:
-        # Future.done acquires a lock, which Ctrl-C could leave acquired, because waits call this method often.
+        # Waits call this method often. Future.done acquires a lock, which Ctrl-C could leave acquired.
         return self._state not in ("PENDING", "RUNNING")
 
 
@@ -254,8 +254,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # `call_soon` calls the function in the next iteration, so that tasks that were just created for earlier calls send
-    # their messages first.
+    # Call the function in the next iteration, after the new tasks of earlier calls have sent their messages.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

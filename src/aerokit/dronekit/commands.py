@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # The fields of MAVLink 1, in the order of a command's text. DroneKit has no `mission_type`, which MAVLink 2 added.
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
 PARAM_FIELDS: list[str] = FIELDS[7:11]
-# Fields whose change makes a mission different from the vehicle's mission.
+# Fields to compare with the vehicle's mission.
 CONTENT_FIELDS: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
 AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
 # The first row of a waypoint file counts as home if it is this close to home; 1e-4 degrees are about ten metres.

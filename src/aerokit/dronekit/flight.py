@@ -278,7 +278,7 @@ class FlightMethods(VehicleAttributes):
         order.add_done_callback(functools.partial(self._dk_on_home_answer, self._home_location))
 
     def _dk_on_home_answer(self, new: LocationGlobal, order: Future[None]) -> None:
-        """Restore the last home of the vehicle if it has rejected the new home, or has not answered."""
+        """Restore the home that the vehicle reported last, if it rejects the new one or does not answer."""
         error = order.exception()
         if error is None:
             self._dk_reported_home = new

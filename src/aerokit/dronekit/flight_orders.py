@@ -349,6 +349,6 @@ def _tune_text(tune: str | bytes) -> str:
         raise InvalidArgument(f"tune = {tune!r} is not allowed: it must be ASCII text") from None
     if "\0" in text or len(text) > sum(TUNE_SIZES):
         raise InvalidArgument(
-            f"tune of {len(text)} characters is not allowed: it must have at most {sum(TUNE_SIZES)}, without NUL"
+            f"tune of {len(text)} characters is not allowed: at most {sum(TUNE_SIZES)} characters, none of them NUL"
         )
     return text

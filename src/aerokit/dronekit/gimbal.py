@@ -113,8 +113,8 @@ class Gimbal(GimbalPrivates):
 
 
 async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
-    # If the autopilot takes altitudes above sea level, the conversion needs home, which may still be unknown when a
-    # program points the camera right after connecting.
+    # For autopilots that take altitudes above sea level, the conversion needs home. It may still be unknown right after
+    # connecting.
     if aio.autopilot.repositions_amsl:
         await aio.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
     await aio.look_at(target)

@@ -188,10 +188,9 @@ class Master:
     ) -> Any:
         """Return the next message of the given types (None: any) that satisfies pymavlink's ``condition``.
 
-        From the first call on, messages are stored: the last 1,000, each for at most five seconds. If none matches,
-        returns None at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises
-        APIException if no stored message matches and the connection is closed, or if it would have to wait on the event
-        loop's own thread.
+        From the first call on, the last 1,000 messages are stored, each for at most five seconds. If none of them
+        matches, return None or, if ``blocking``, wait for ``timeout`` seconds (None: no limit). In both cases, raise
+        APIException if the connection is closed. Waiting on the event loop's own thread also raises APIException.
         """
         types = (type,) if isinstance(type, str) else type
         names = None if types is None else set(types)
@@ -210,7 +209,7 @@ class Master:
         return getattr(self.messages.get(type), field, default)
 
     def time_since(self, mtype: str) -> float:
-        """Return the seconds since the last message of a type; before the first, since ``messages`` was first used."""
+        """Return the seconds since the last message of a type, or since the first use of ``messages`` without one."""
         return self.messages.age_s(mtype)
 
     def param(self, name: str, default: float | None = None) -> float | None:
@@ -229,7 +228,7 @@ class Master:
         fix = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
         self.recv_match(type="VFR_HUD", blocking=True)  # As in pymavlink, the altitude is from VFR_HUD.
         self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
-        # The messages that were waited for may have been stored for seconds, so the last ones are used.
+        # The matching messages may be seconds old, so use the latest ones.
         gps, hud, position = map(self.messages.__getitem__, ("GPS_RAW_INT", "VFR_HUD", "GLOBAL_POSITION_INT"))
         if gps.fix_type < 3:  # The fix was lost meanwhile.
             gps = fix

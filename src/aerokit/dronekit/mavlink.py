@@ -45,8 +45,8 @@ MAX_OPEN_ATTEMPTS, RETRY_INTERVAL_S = 3, 1.0
 class MAVConnection(ClassicConnection):
     """An open link to a vehicle, with an event loop on a separate thread.
 
-    ``ip`` is a connection string of DroneKit, pymavlink (a bare ``host:port`` and ``udp:`` listen) or aerokit. A lost
-    link is reopened. ``use_native`` is ignored.
+    ``ip`` is a connection string of DroneKit, pymavlink or aerokit. As in pymavlink, a bare ``host:port`` and ``udp:``
+    listen. A lost link is reopened. ``use_native`` is ignored.
 
     Raises:
         OSError: the link cannot be opened: ConnectionRefusedError, socket.gaierror, serial.SerialException …

@@ -138,7 +138,7 @@ async def _download(
         return
     except AerokitError as error:
         on_failure(error)
-        # The pause limits the attempts, because a waiting program starts the next download as soon as this one ends.
+        # A waiting program starts the next download as soon as this one ends, so a pause limits the attempts.
         await anyio.sleep(RETRY_DELAY_S)
     finally:
         on_ended()

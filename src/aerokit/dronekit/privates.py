@@ -17,8 +17,8 @@ HEARTBEAT_TIMEOUT_S = 5.0  # DroneKit reports a link time-out after this many se
 class OverridableProperty(Generic[T]):
     """A property that an instance attribute of the same name overrides.
 
-    Used for names to which a program's subclass of Vehicle may assign its own attributes: those that DroneKit 2.9 does
-    not have, and its private ones.
+    Used for private names of DroneKit 2.9, and for names that it does not have: a program's subclass of Vehicle may
+    assign its own attributes to them.
     """
 
     def __init__(self, getter: Callable[[Any], T]) -> None:

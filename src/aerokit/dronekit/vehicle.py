@@ -266,9 +266,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._handler.vehicle = self
         self._handler.note_sent = aio.note_sent
         self._handler.calls.describe = self._dk_describe
-        # The event loop keeps these callbacks, so they have only weak references to this vehicle. It can then be
-        # garbage collected when the program drops it. `_handler` may have strong ones, because it belongs to this
-        # vehicle.
+        # The event loop keeps these callbacks, so weak references let the vehicle be garbage collected. `_handler` may
+        # have strong ones, because it belongs to this vehicle.
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
         aio._session.on_reboot.append(weak_callback(self._dk_forget_home))
         # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.

@@ -225,8 +225,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
             if first is None:
                 merged[enum.name] = enum
                 continue
-            # The enum itself is that of the first file.
-            # An entry in a later file replaces an entry with the same name.
+            # Everything but the entries is from the first file. Of entries with the same name, the last one is used.
             entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
             ordered = sorted(entries.values(), key=lambda entry: entry.value)
             merged[enum.name] = replace(first, entries=tuple(ordered))

@@ -73,7 +73,7 @@ class FrameEncoder:
             if compiled is not None:
                 self.sequence = (self.sequence + 1) & 0xFF
                 return compiled if signing is None else compiled + signing.sign(compiled, now)
-            # The result is None until this type has a layout. The layout is made now, for the next message.
+            # Compiled code cannot encode this type yet. Make its layout, for the next message.
             layout_of(type(message))
         payload = message.encode()
         message_id = message.ID

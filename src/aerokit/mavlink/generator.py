@@ -67,7 +67,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
         existing = merged.get(added.name)
         if existing is not None:
             entries = _merged_entries(existing, added)
-            # New entries do not change the Python names of existing ones, which depend on the prefix.
+            # Keep the prefix, because the Python names of the existing entries depend on it.
             added = _with_first_origin(replace(existing, entries=entries, own_prefix=existing.prefix), added)
         merged[added.name] = added
     return list(merged.values())

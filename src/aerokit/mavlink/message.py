@@ -29,7 +29,7 @@ MessageT = TypeVar("MessageT", bound="Message")
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
 # (message, field) of ``char`` arrays that carry a number or a text, depending on another field. They are decoded as
-# bytes, because a string ends at the first NUL, so that a number would be truncated.
+# bytes, because a text would end at the first zero byte of a number.
 BYTES_IN_CHARS = frozenset((name, "param_value") for name in ("PARAM_EXT_VALUE", "PARAM_EXT_SET", "PARAM_EXT_ACK"))
 # Fields whose values are secret, and therefore never appear in texts.
 SECRET_FIELDS = frozenset(("secret_key", "passkey", "password"))

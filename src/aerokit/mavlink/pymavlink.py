@@ -30,9 +30,9 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
     """Convert a message to one of aerokit, for ``vehicle.send``. The result is a validated copy.
 
     Args:
-        message: a pymavlink message of any dialect, for MAVLink 1 or 2; or any object with ``get_type()`` and the
-            fields of a standard message as attributes; or a message of aerokit. Numbers in integer fields are rounded.
-            Strings may be ``str`` (sent as UTF-8) or bytes. Missing extension fields are 0.
+        message: a pymavlink message of any dialect, for MAVLink 1 or 2, or a message of aerokit. Any other object must
+            have ``get_type()`` and, as attributes, the fields of a standard message. Numbers in integer fields are
+            rounded. Strings may be ``str`` (sent as UTF-8) or bytes. Missing extension fields are 0.
         target_system: new value of the field ``target_system``, if the message has this field. It is also assigned to
             ``message`` itself, unless that is a message of aerokit. None and 0 leave the field unchanged.
             ``target_component`` is never changed.

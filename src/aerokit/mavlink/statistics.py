@@ -126,7 +126,7 @@ class SourceStatistics(SourceFields):
 
     def _on_gap(self, ahead: int, now: float) -> None:
         """Process a frame after ``ahead`` missing frames."""
-        # A frame that arrives late is subtracted again.
+        # If a missing frame arrives late, it is subtracted again.
         self.lost += ahead
         if ahead > _MAX_GAP:  # The frame may belong to another stream.
             self._begin_stream(now)

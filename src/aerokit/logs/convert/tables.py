@@ -204,7 +204,7 @@ class MessageTablesWriter:
         self._path, self._log, self._kind = path, log, kind
         log.needs_states = False
         self._tables: list[Table] = []
-        # Maps each record type to the function that adds a row to its table, and the one that makes a record's row.
+        # For each record type: a function that adds a row to its table, and one that converts a record to a row.
         self._converters: dict[str, tuple[_AddRow, _MakeRow]] = {}
         self.written: int = 0
 

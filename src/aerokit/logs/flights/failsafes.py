@@ -91,7 +91,7 @@ _ACTION_PATTERN = re.compile(
 )
 
 _PX4_PREFIXES = ("BAT_", "COM_", "FD_", "GF_", "NAV_")
-# Maps kinds of failsafes to the parameters that define when the failsafe triggers, and its action.
+# Maps kinds of failsafes to the parameters for their limits and actions.
 _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
     "battery": (
         *("BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER", "BATT_LOW_MAH", "BATT_CRT_MAH"),

@@ -156,7 +156,7 @@ class _Tables:
         return time <= self._max_s and not (is_outlier and 0.0 <= before <= after + _MAX_DISORDER_S)
 
     def _first_time(self) -> int:
-        # The order is that of the positions in the file. The lowest time could be that of a damaged row.
+        # Use the row that is first in the file. The row with the lowest time could be a damaged one.
         first_rows = list(self._rows_at(0))
         if not first_rows:
             raise FileFormatError(
@@ -166,7 +166,7 @@ class _Tables:
         return time_us
 
     def _rows_at(self, index: int) -> Iterator[tuple[int, int]]:
-        """For each table that has a row ``index``, yield the offset of this row and its time in microseconds."""
+        """Yield the offset and the time in microseconds of row ``index`` of each table that is long enough."""
         reader = self._reader
         for number in reader.name_to_id.values():
             offsets, row_format = reader.offsets[number], reader.formats[number]

@@ -51,7 +51,7 @@ _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
 def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Read a flight's file into it: the data of this system id or, if that is None, of the first autopilot.
+    """Fill a flight from its file, with the data of ``system_id`` or, if that is None, of the first autopilot.
 
     Raises:
         FileFormatError: the log has no heartbeat of an autopilot with this system id.

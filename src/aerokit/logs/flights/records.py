@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
     from aerokit.mavlink.message import Message
 
-# `fields` of a record that was made from a MAVLink message, whose values are in `message` instead.
+# The `fields` of a record with a MAVLink message: its values are in `message`.
 _NO_FIELDS: Mapping[str, Any] = {}
 _PARAMETER_IDS = frozenset((Heartbeat.ID, AutopilotVersion.ID, ParamSet.ID, ParamValue.ID))
 

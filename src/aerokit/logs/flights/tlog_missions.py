@@ -20,7 +20,7 @@ MissionMessage: TypeAlias = (
 _DEGREES_E7 = 1e7
 _MISSION_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
 _OPENING = (MavFtpOpcode.OPENFILERO, MavFtpOpcode.OPENFILEWO, MavFtpOpcode.CREATEFILE)
-_NO_MISSION_ITEM = (2, 3)  # values of `current` with which an item is a target or an altitude for GUIDED
+_NO_MISSION_ITEM = (2, 3)  # values of `current` for a target or an altitude in GUIDED
 _READING = (MavFtpOpcode.READFILE, MavFtpOpcode.BURSTREADFILE)
 
 

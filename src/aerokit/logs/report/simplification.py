@@ -46,9 +46,8 @@ def simplify(
             selected.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
-    # Heap entries: the negative square of the largest deviation from a segment, the index of the point with this
-    # deviation, and the first and last index of the segment. The square is negative, because heapq returns the smallest
-    # item first.
+    # A heap of segments: the negative square of the largest deviation from the segment, the index of the point that has
+    # it, and the first and last index of the segment. Negative, because heapq returns the smallest item first.
     segments = [
         (*_deviation(places, first, last), first, last)
         for first, last in pairwise(sorted(selected))
