@@ -128,7 +128,7 @@ class Channels(_ChannelDict):
         self._store(first_index, FIRST_VALUES(message))
 
     def _store(self, first_index: int, received: tuple[int, ...]) -> None:
-        """Store consecutive values. The first is that of channel ``first_index + 1``."""
+        """Store the values of consecutive channels, from number ``first_index + 1`` on."""
         with self._changing:
             numbers = NUMBERS[first_index : self._count]
             values = (None if value == UNUSED else value for value in received)

@@ -77,7 +77,7 @@ class ClassicConnection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message without blocking, from any thread.
 
-        Messages are sent in the order of the calls. ``to`` is that of :meth:`Connection.send`. Raises InvalidArgument
+        Messages are sent in the order of the calls. ``to`` is as in :meth:`Connection.send`. Raises InvalidArgument
         if a field is out of range, and APIException if the connection is closed.
         """
         message.encode()  # Raises for an invalid field here. On the loop, the error would only be logged.

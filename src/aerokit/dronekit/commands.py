@@ -246,7 +246,7 @@ class CommandSequence:
 
     def __setitem__(self, index: int, value: Any) -> None:
         self._require_downloaded()
-        # As in DroneKit, the object itself is stored, unlike by add(), so that the program can continue to edit it.
+        # Unlike add(), store the object itself, as DroneKit does, so that the program can continue to edit it.
         command = value if isinstance(value, Command) else _command_from(value)
         with self._lock:
             items = list(self._state.items)
@@ -369,7 +369,7 @@ def _comparable(value: Any) -> Any:
 
 
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
-    """Return True if a command is the home row of a waypoint file."""
+    """Return True if a command looks like the home row of a waypoint file."""
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False
     if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):

@@ -62,7 +62,7 @@ class Readiness:
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
-        """Let programs that wait for the attribute raise this error."""
+        """Raise this error in all threads that wait for the attribute."""
         with self._lock:
             self._failures[name] = error
             self._notify()
@@ -389,5 +389,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    # Classes whose constructors take the vehicle, as in DroneKit, get the core from here.
+    # For classes whose constructors take the vehicle, as in DroneKit.
     return vehicle._dk

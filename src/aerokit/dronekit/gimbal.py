@@ -121,7 +121,7 @@ async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
 
 
 def _checked(name: str, value: float) -> float:
-    """Check an angle. Beyond ±`MAX_ANGLE_DEG`, it is wrapped to ±180 degrees."""
+    """Return the angle. If it is beyond ±`MAX_ANGLE_DEG`, it is wrapped to ±180 degrees."""
     try:
         number = float(value)
     except (TypeError, ValueError):

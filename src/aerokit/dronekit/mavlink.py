@@ -193,7 +193,7 @@ _created_connections: ContextVar[weakref.WeakSet[MAVConnection] | None] = Contex
 
 @contextlib.contextmanager
 def created_connections() -> Iterator[weakref.WeakSet[MAVConnection]]:
-    """Collect the connections that this thread creates in the block."""
+    """Collect the connections that this thread creates in the ``with`` block."""
     connections: weakref.WeakSet[MAVConnection] = weakref.WeakSet()
     token = _created_connections.set(connections)
     try:

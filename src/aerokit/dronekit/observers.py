@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("dronekit")
 
 AttributeListener = Callable[[Any, str, Any], object]
-"""Called as ``listener(object, name, value)``; the value is that of an attribute, or a message of pymavlink."""
+"""Called as ``listener(object, name, value)``. The value is an attribute's value, or a message of pymavlink."""
 
 ListenerT = TypeVar("ListenerT", bound=AttributeListener)
 

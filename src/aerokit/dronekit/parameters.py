@@ -48,7 +48,7 @@ ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an 
 
 
 class ParameterDownload:
-    """Downloads the parameters once the vehicle is connected. A failure is logged once, as a warning.
+    """Downloads the parameters after the vehicle has connected. Only the first failure is logged, as a warning.
 
     A failed download is repeated only while a program waits for parameters.
     """

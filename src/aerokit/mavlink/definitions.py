@@ -126,7 +126,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum. Its entries are those of one XML file or, if `merged_enums` created it, those of all files."""
+    """One enum, as one XML file defines it, or with the entries of all files (`merged_enums`)."""
 
     name: str
     entries: tuple[EntryDefinition, ...]
@@ -275,7 +275,7 @@ def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinitio
     # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
-        raise ValueError(f"unknown field type {node.attrib['type']!r}")
+        raise ValueError(f"{message}: unknown field type {node.attrib['type']!r}")
     type_, array_length = match[1], int(match[2] or 0)
     return FieldDefinition(
         name=_identifier(node.attrib["name"]),
@@ -372,7 +372,7 @@ def _remarks(node: Element) -> tuple[str, ...]:
 
 
 def _common_prefix(enum: str, names: list[str]) -> str:
-    """Return the enum's name if most entries begin with it, else the words with which all begin."""
+    """Return the enum's name if most entries begin with it, otherwise the words that all entries begin with."""
     if not names:
         return ""
     enum_prefix = enum + "_"

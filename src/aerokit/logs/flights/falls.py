@@ -132,7 +132,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if all heights of the next 30 s, or until disarming, are about ``height_m``."""
+    """Return True if the vehicle stays at about ``height_m`` until disarming (at most 30 s), and does not hover."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log

@@ -148,7 +148,7 @@ class _Tables:
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        # Rows have no checksum. One time that is too late would replace those of all later rows in a `TimeSeries`.
+        # Rows have no checksum. After a time that is too late, `TimeSeries` would use this time for all later rows.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time

@@ -60,7 +60,7 @@ class ClockComparison:
 
     @property
     def missing_s(self) -> float:
-        """Seconds of the vehicle's clock that are missing in the recording, whose computer probably slept."""
+        """Seconds of the vehicle's clock that the recording lacks, probably because its computer slept."""
         return self._long_vehicle_s - self._long_recorded_s if self._is_comparable else 0.0
 
     @property

@@ -31,8 +31,8 @@ def simplify(
         keep: indices that are selected if their coordinates are known.
 
     Returns:
-        The selected indices, including that of one NaN in each gap, and the largest distance of an omitted point from
-        the line through the selected points.
+        The selected indices, with one index for each gap, and the largest distance of an omitted point from the line
+        through the selected points.
     """
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):
