@@ -161,8 +161,8 @@ class CommandSequence:
     def upload(self, timeout: float | None = None) -> None:
         """Upload the commands, and return when the vehicle has confirmed them.
 
-        Sends nothing if the commands have not changed since the last download or upload. The sequence
-        itself does not change, so that a failed upload can be repeated.
+        Sends nothing if the commands have not changed since the last download or upload. A failed upload does not
+        change the sequence, and can be repeated.
 
         Args:
             timeout: seconds in total; None: no limit, but ten seconds without progress raise TimeoutError.
@@ -177,7 +177,7 @@ class CommandSequence:
             content = _content_of(self._state.items)
             if not self._state.is_changed and content == self._vehicle_content:
                 return
-            uploaded = self._state = self._state.replace(is_changed=True)  # It stays True unless the upload succeeds.
+            uploaded = self._state = self._state.replace(is_changed=True)  # stays True if the upload fails
         aio = self._core.check_link()
         # DroneKit does not limit the distance of waypoints, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}

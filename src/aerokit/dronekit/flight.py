@@ -86,10 +86,11 @@ class FlightMethods(VehicleAttributes):
     def armed(self) -> bool:
         """True if HEARTBEAT reports armed motors.
 
-        Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait. It sends nothing if the
-        vehicle already reports the value, unless an opposite order is pending. An order to disarm is always sent to a
-        silent vehicle, because its last report may be outdated. As in DroneKit, the truth of the value counts: the
-        string ``"False"`` arms. :meth:`arm` waits, and raises the reason of a refusal.
+        Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait; :meth:`arm` waits, and
+        raises the reason of a refusal. As in DroneKit, the truth of the value counts: the string ``"False"`` arms.
+
+        Nothing is sent if the vehicle already reports the value. There are two exceptions: an opposite order is
+        pending, or the order is to disarm a silent vehicle, whose last report may be outdated.
         """
         return self._armed
 

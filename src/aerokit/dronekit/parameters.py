@@ -233,12 +233,13 @@ WAIT_TIMEOUT_S = 30.0
 class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers):
     """Maps names to values: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
-    Names are converted to upper case; values are floats. All parameters are downloaded in the background after
-    connecting. They are not downloaded again after a reboot or a lost link; changes that the vehicle reports are
-    included. Reading a missing value requests only that value; iterating waits for the whole list. :func:`len` returns
-    the number received so far.
+    Names are converted to upper case; values are floats. Old and new names of parameters that ArduPilot renamed both
+    work; values are converted, and a warning is logged.
 
-    Old and new names of parameters that ArduPilot renamed both work; values are converted, and a warning is logged.
+    All parameters are downloaded in the background after connecting, but not again after a reboot or a lost link.
+    Changes that the vehicle reports are included. Reading a missing value requests only that value; iterating waits for
+    the whole list. :func:`len` returns the number received so far.
+
     Listeners are called as ``listener(parameters, name, value)`` when a value is new or has changed. Methods that wait
     raise APIException while the link is down, and TimeoutError after 30 seconds.
     """

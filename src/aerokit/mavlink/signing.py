@@ -150,9 +150,9 @@ class Signing:
                 different link ids.
             timestamp: the last value of :attr:`timestamp` with this key (10 µs since 2015), for computers whose clock
                 may be wrong. A later time of the clock takes precedence.
-            allow_unsigned: a function that returns True for a frame to accept it without a valid signature, for example
-                from a camera without a key. Anyone can send such frames. None accepts only RADIO_STATUS, which
-                telemetry radios send.
+            allow_unsigned: called with each frame without a valid signature; returns True to accept it, for example
+                from a camera without a key. Anyone can send such frames. RADIO_STATUS and RADIO, which telemetry radios
+                send, are always accepted.
             keep: a file that stores the timestamp, so that a restarted program refuses frames from before the restart.
                 Each key needs a separate file, and two programs must not use one file at the same time. The file is
                 replaced atomically, at most twice a minute. Its timestamp is up to half a minute in the future.
