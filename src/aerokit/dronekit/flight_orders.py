@@ -202,8 +202,8 @@ def check_speed(name: str, speed: float | None) -> None:
 class CurrentCommand:
     """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
 
-    For all autopilots, the first item is 1, as in ArduPilot, which counts home as 0 and reports 0 before it flies a
-    mission. PX4's numbers are converted; they become 0 while no mission is active.
+    The numbers are ArduPilot's for all autopilots: home is 0, the first item is 1. ArduPilot reports 0 before it flies
+    a mission. PX4 counts the first item as 0, so its numbers are converted; they become 0 while no mission is active.
     """
 
     def __init__(self, core: Core) -> None:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
-# Messages are stored from the first access on. A look-up within this time after it waits until the message arrives.
+# Messages are stored from the first access on. For this long, a look-up then waits until its message arrives.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
 
@@ -209,7 +209,7 @@ class Master:
         return getattr(self.messages.get(type), field, default)
 
     def time_since(self, mtype: str) -> float:
-        """Return the seconds since the last message of a type, or since the first use of ``messages`` without one."""
+        """Return the seconds since the last message of a type, or since the first access if there was none."""
         return self.messages.age_s(mtype)
 
     def param(self, name: str, default: float | None = None) -> float | None:

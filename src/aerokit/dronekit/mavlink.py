@@ -138,8 +138,8 @@ class MAVConnection(ClassicConnection):
 
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
-        # Tests of programs set this to False, which discards received bytes, to simulate a silent link.
-        # The link calls `bytes_received` with received bytes. An instance attribute of this name hides the method.
+        # Tests of programs set this to False to simulate a silent link. Received bytes are then discarded: an instance
+        # attribute hides the method `bytes_received`, which the link calls.
         if value:
             vars(self.connection).pop("bytes_received", None)
         else:

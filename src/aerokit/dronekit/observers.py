@@ -157,7 +157,7 @@ class HasObservers:
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Remove a listener. ValueError if it is not one of the name's listeners; ignored if there are none."""
+        """Remove a listener. Ignored if the name has no listeners; ValueError if this listener is not among them."""
         self._dk_listeners.remove(self._dk_normalized(attr_name), observer)
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:

@@ -194,8 +194,8 @@ class _RawText(str):
         return self._data
 
 
-# pymavlink dialects in which a message class is searched if the program's dialect has none. Together they have all
-# messages of STANDARD.
+# pymavlink dialects to search for a message that the program's dialect does not have. Together, they have all messages
+# of STANDARD.
 DIALECTS = ("ardupilotmega", "development")
 
 CHECKSUM_LENGTH = 2
@@ -277,9 +277,9 @@ class _Layout:
 
     def __init__(self, message_class: Any) -> None:
         zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
-        # Attribute names in wire order. For a text field, it is the name of the attribute with the raw bytes.
+        # The attributes in wire order; for a text field, the attribute with the raw bytes.
         self.names: list[str] = []
-        # For each field, the position of its first value and the number of its values; empty if there are no arrays.
+        # The position and the number of each field's values; empty if there are no arrays.
         self.arrays: list[tuple[int, int]] = []
         self.texts: list[tuple[str, str]] = []  # for each text field, its name and the name of its raw bytes
         position = 0

@@ -123,8 +123,7 @@ class _Tables:
         row_format = reader.formats[reader.name_to_id[table]]
         indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
         unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
-        # The values of an unpacked row have the order of the file. `positions` has the places of TimeUS and of each of
-        # `columns` among them.
+        # An unpacked row has the order of the file. `positions` has the index of each requested column in it.
         positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]
