@@ -71,8 +71,9 @@ class Channels(_ChannelDict):
     """RC input of the autopilot, overrides included: microseconds by number (``'1'`` or 1). Read only.
 
     The values come from RC_CHANNELS and RC_CHANNELS_RAW. All values of a message are stored at once. A channel is None
-    if it does not exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW of port 1, which
-    has channels 9 to 16. Setting :attr:`count` changes the number. :attr:`overrides` changes channels.
+    if it does not exist or was not received. Set :attr:`overrides` to change channels.
+
+    There are :attr:`count` channels: eight at first, 16 once an RC_CHANNELS_RAW with channels 9 to 16 has arrived.
     """
 
     def __init__(self, vehicle: VehicleCore, count: int) -> None:
@@ -127,7 +128,7 @@ class Channels(_ChannelDict):
         self._store(first_index, FIRST_VALUES(message))
 
     def _store(self, first_index: int, received: tuple[int, ...]) -> None:
-        """Store consecutive values. The first is that of channel ``first_index + 1``."""
+        """Store the values of consecutive channels, from number ``first_index + 1`` on."""
         with self._changing:
             numbers = NUMBERS[first_index : self._count]
             values = (None if value == UNUSED else value for value in received)
@@ -144,10 +145,11 @@ class Channels(_ChannelDict):
 class ChannelsOverride(_ChannelDict):
     """Overridden channels: microseconds by number. Each change is sent at once, as RC_CHANNELS_OVERRIDE.
 
-    Set a channel to 1000–2000 (any 16-bit value is sent); set it to None or 0, or delete it, to release it to the
-    radio. Each change also releases all other channels from 1 to 8, even if another program overrides them; other
-    channels above 8 are left as they are. Raises KeyError for an invalid channel and ValueError for an invalid value,
-    without changing or sending anything.
+    Set a channel to 1000–2000 (any 16-bit value is sent). To release it to the radio, set it to None or 0, or delete
+    it. An invalid channel (KeyError) or value (ValueError) changes and sends nothing.
+
+    Each change releases all channels from 1 to 8 that are not in this dict, even if another program overrides them.
+    Other channels above 8 are left as they are.
 
     **Nothing is repeated**: the vehicle ends overrides when it receives none for a while (ArduPilot: RC_OVERRIDE_TIME,
     3 s), which makes a hanging program safe. To hold a stick, set it several times a second. All channels are released

@@ -77,7 +77,7 @@ class ClassicConnection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message without blocking, from any thread.
 
-        Messages are sent in the order of the calls. ``to`` is that of :meth:`Connection.send`. Raises InvalidArgument
+        Messages are sent in the order of the calls. ``to`` is as in :meth:`Connection.send`. Raises InvalidArgument
         if a field is out of range, and APIException if the connection is closed.
         """
         message.encode()  # Raises for an invalid field here. On the loop, the error would only be logged.
@@ -164,7 +164,7 @@ class BackgroundCall(concurrent.futures.Future[None]):
         self.task: asyncio.Task[None] | None = None
 
     def done(self) -> bool:
-        # Future.done acquires a lock, which Ctrl-C could leave acquired, because waits call this method often.
+        # Waits call this method often. Future.done acquires a lock, which Ctrl-C could leave acquired.
         return self._state not in ("PENDING", "RUNNING")
 
 
@@ -254,8 +254,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # `call_soon` calls the function in the next iteration, so that tasks that were just created for earlier calls send
-    # their messages first.
+    # Call the function in the next iteration, after the new tasks of earlier calls have sent their messages.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # The fields of MAVLink 1, in the order of a command's text. DroneKit has no `mission_type`, which MAVLink 2 added.
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
 PARAM_FIELDS: list[str] = FIELDS[7:11]
-# Fields whose change makes a mission different from the vehicle's mission.
+# Fields to compare with the vehicle's mission.
 CONTENT_FIELDS: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
 AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
 # The first row of a waypoint file counts as home if it is this close to home; 1e-4 degrees are about ten metres.
@@ -161,8 +161,8 @@ class CommandSequence:
     def upload(self, timeout: float | None = None) -> None:
         """Upload the commands, and return when the vehicle has confirmed them.
 
-        Sends nothing if the commands have not changed since the last download or upload. The sequence
-        itself does not change, so that a failed upload can be repeated.
+        Sends nothing if the commands have not changed since the last download or upload. A failed upload does not
+        change the sequence, and can be repeated.
 
         Args:
             timeout: seconds in total; None: no limit, but ten seconds without progress raise TimeoutError.
@@ -177,7 +177,7 @@ class CommandSequence:
             content = _content_of(self._state.items)
             if not self._state.is_changed and content == self._vehicle_content:
                 return
-            uploaded = self._state = self._state.replace(is_changed=True)  # It stays True unless the upload succeeds.
+            uploaded = self._state = self._state.replace(is_changed=True)  # stays True if the upload fails
         aio = self._core.check_link()
         # DroneKit does not limit the distance of waypoints, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
@@ -214,8 +214,8 @@ class CommandSequence:
         """Append a copy of a command; :meth:`upload` sends the change. Waits for a running download.
 
         ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` is set. If
-        the sequence is empty and ``cmd`` has the form of the home row that begins a waypoint file, it is stored as home
-        instead of being appended. Raises APIException if the last download has failed.
+        the sequence is empty, a command that looks like the home row of a waypoint file is stored as home instead.
+        Raises APIException if the last download has failed.
         """
         self._require_downloaded()
         added = _command_from(cmd)
@@ -246,7 +246,7 @@ class CommandSequence:
 
     def __setitem__(self, index: int, value: Any) -> None:
         self._require_downloaded()
-        # As in DroneKit, the object itself is stored, unlike by add(), so that the program can continue to edit it.
+        # Unlike add(), store the object itself, as DroneKit does, so that the program can continue to edit it.
         command = value if isinstance(value, Command) else _command_from(value)
         with self._lock:
             items = list(self._state.items)
@@ -369,7 +369,7 @@ def _comparable(value: Any) -> Any:
 
 
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
-    """Return True if a command is the home row of a waypoint file."""
+    """Return True if a command looks like the home row of a waypoint file."""
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False
     if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):

@@ -62,7 +62,7 @@ class Readiness:
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
-        """Let programs that wait for the attribute raise this error."""
+        """Raise this error in all threads that wait for the attribute."""
         with self._lock:
             self._failures[name] = error
             self._notify()
@@ -78,9 +78,9 @@ class Readiness:
         return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
-        """Wait a short time until any attribute gets a value or fails.
+        """Wait a short time until an attribute gets a value, or reading an attribute fails.
 
-        Returns at once if all attributes in ``names`` have values, or if a missing one has failed.
+        Returns at once if no attribute in ``names`` is missing, or if reading a missing one has failed.
         """
         with self._lock:
             missing, changed = names - self.names, self._changed
@@ -99,8 +99,8 @@ class LatestMessage(Generic[MessageT]):
         self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
-        # Attributes whose change the handlers only report, so that the message may be decoded later. If a handler needs
-        # each message, this set is empty.
+        # If not empty, the handlers only notify the listeners of these attributes. Without listeners, the message can
+        # then be decoded later.
         self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
@@ -146,7 +146,7 @@ class LatestMessage(Generic[MessageT]):
     def _must_decode(self) -> bool:
         """Return True if a handler needs the message now."""
         names = self._announced_names
-        # A handler without names needs each message. Attributes without a value need the first one.
+        # Without names, the handlers need each message. With names, they need it until all attributes have a value.
         if not names or not names <= self._ready_names:
             return True
         for listeners in self._listeners:
@@ -220,9 +220,9 @@ class Core:
 
         The handler is called on the loop thread, as long as this object exists. Add it before the vehicle is connected.
 
-        If the handler only notifies the listeners of attributes, pass the ``names`` of the attributes. The handlers of
-        this message type are then called only while one of the attributes has no value yet, or has listeners on the
-        vehicle or in ``listeners``. This concerns all handlers of the type, so pass names for all of them or for none.
+        If the handler only notifies the listeners of attributes, pass the ``names`` of the attributes. After the first
+        value of each, it is then called only while one of them has listeners on the vehicle or in ``listeners``. Pass
+        names for all handlers of a message type or for none, because the handlers are called together.
         """
         if message_type not in self._latest:
             self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)
@@ -299,7 +299,7 @@ class Core:
 
 
 def _recording_activity(original: property) -> property:
-    """Wrap a property, so that reading it lets our heartbeat continue."""
+    """Wrap a property, so that reading it keeps our heartbeat going."""
     getter = original.fget
     assert getter is not None
 
@@ -346,18 +346,17 @@ class VehicleCore(HasObservers):
             types: names of attributes, including your own; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
                 ``'armed'``, ``'mode'`` and ``'attitude'``.
             timeout: seconds; None: no limit.
-            raise_exception: raise TimeoutError after ``timeout``; otherwise return False.
+            raise_exception: if false, return False instead of raising the errors about missing values.
             still_waiting_callback: called with the missing names.
             still_waiting_interval: seconds between these calls.
 
         Returns:
-            True if all these attributes have values. If ``raise_exception`` is false, False after ``timeout``, or if
-            reading an attribute has failed.
+            True if all these attributes have values.
 
         Raises:
-            TimeoutError: a value is missing after ``timeout``, and ``raise_exception`` is true.
+            TimeoutError: a value is missing after ``timeout``.
+            APIException: reading an attribute has failed; or the link is down, whatever ``raise_exception`` is.
             ValueError: a name is not a string.
-            APIException: the link is down, or reading an attribute has failed and ``raise_exception`` is true.
         """
         waits_for_defaults = not types or types == (True,)
         names = DEFAULT_ATTRIBUTES if waits_for_defaults else types
@@ -390,5 +389,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    # Classes whose constructors take the vehicle, as in DroneKit, get the core from here.
+    # For classes whose constructors take the vehicle, as in DroneKit.
     return vehicle._dk

@@ -86,10 +86,11 @@ class FlightMethods(VehicleAttributes):
     def armed(self) -> bool:
         """True if HEARTBEAT reports armed motors.
 
-        Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait. It sends nothing if the
-        vehicle already reports the value, unless an opposite order is pending. An order to disarm is always sent to a
-        silent vehicle, because its last report may be outdated. As in DroneKit, the truth of the value counts: the
-        string ``"False"`` arms. :meth:`arm` waits, and raises the reason of a refusal.
+        Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait; :meth:`arm` waits, and
+        raises the reason of a refusal. As in DroneKit, the truth of the value counts: the string ``"False"`` arms.
+
+        Nothing is sent if the vehicle already reports the value. There are two exceptions: an opposite order is
+        pending, or the order is to disarm a silent vehicle, whose last report may be outdated.
         """
         return self._armed
 
@@ -134,8 +135,8 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # If an opposite order was overruled, HEARTBEAT may still report the state from before that order. In
-                # this case, `_armed` is reliable only after `order` is done.
+                # After an opposite order, HEARTBEAT may still report the state from before both orders, so `order` must
+                # be done, too.
                 return self._dk_reports_armed(value) and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
@@ -278,7 +279,7 @@ class FlightMethods(VehicleAttributes):
         order.add_done_callback(functools.partial(self._dk_on_home_answer, self._home_location))
 
     def _dk_on_home_answer(self, new: LocationGlobal, order: Future[None]) -> None:
-        """Restore the last home of the vehicle if it has rejected the new home, or has not answered."""
+        """Restore the home that the vehicle reported last, if it rejects the new one or does not answer."""
         error = order.exception()
         if error is None:
             self._dk_reported_home = new
@@ -333,7 +334,7 @@ class FlightMethods(VehicleAttributes):
         self.wait_for(has_reached, timeout, errmsg="failed to reach specified altitude")
 
     def _dk_altitude_condition(self, alt: float, epsilon: float, *, is_relative: bool) -> Callable[[], bool]:
-        """Return a function that is true once the altitude is near ``alt``, or has passed it since the first call."""
+        """Return a function: True if the altitude is near ``alt``, or has passed ``alt`` since the first call."""
         start: float | None = None
 
         def has_reached() -> bool:

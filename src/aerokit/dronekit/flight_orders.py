@@ -85,7 +85,7 @@ def _px4_base_mode(name: str) -> int:
 
 
 def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
-    """Return the vehicle's autopilot, or ArduPilot if its mode numbers are unknown."""
+    """Return the vehicle's autopilot; ArduPilot for autopilots whose mode numbers are unknown."""
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
     # pymavlink, too, uses ArduPilot's mode numbers for autopilots such as iNav.
@@ -202,8 +202,8 @@ def check_speed(name: str, speed: float | None) -> None:
 class CurrentCommand:
     """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
 
-    ArduPilot counts home as item 0, and reports 0 before it flies a mission. PX4 counts the first item as 0; for PX4
-    this class reports the first item as 1, and 0 while no mission is active.
+    The numbers are ArduPilot's for all autopilots: home is 0, the first item is 1. ArduPilot reports 0 before it flies
+    a mission. PX4 counts the first item as 0, so its numbers are converted; they become 0 while no mission is active.
     """
 
     def __init__(self, core: Core) -> None:
@@ -349,6 +349,6 @@ def _tune_text(tune: str | bytes) -> str:
         raise InvalidArgument(f"tune = {tune!r} is not allowed: it must be ASCII text") from None
     if "\0" in text or len(text) > sum(TUNE_SIZES):
         raise InvalidArgument(
-            f"tune of {len(text)} characters is not allowed: it must have at most {sum(TUNE_SIZES)}, without NUL"
+            f"tune of {len(text)} characters is not allowed: at most {sum(TUNE_SIZES)} characters, none of them NUL"
         )
     return text

@@ -71,8 +71,8 @@ class Gimbal(GimbalPrivates):
 
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
-            roll: degrees from the horizon. A roll other than 0 is sent by MAVLink's older mount command. The camera
-                then points at ``yaw`` at first, but turns with the vehicle afterwards.
+            roll: degrees from the horizon. With a roll other than 0, the camera points at ``yaw`` only at first, and
+                then turns with the vehicle, because MAVLink's older mount command is sent.
             yaw: degrees clockwise from north.
         """
         pitch = _checked("pitch", pitch)
@@ -113,15 +113,15 @@ class Gimbal(GimbalPrivates):
 
 
 async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
-    # If the autopilot takes altitudes above sea level, the conversion needs home, which may still be unknown when a
-    # program points the camera right after connecting.
+    # For autopilots that take altitudes above sea level, the conversion needs home. It may still be unknown right after
+    # connecting.
     if aio.autopilot.repositions_amsl:
         await aio.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
     await aio.look_at(target)
 
 
 def _checked(name: str, value: float) -> float:
-    """Check an angle. Beyond ±`MAX_ANGLE_DEG`, it is wrapped to ±180 degrees."""
+    """Return the angle. If it is beyond ±`MAX_ANGLE_DEG`, it is wrapped to ±180 degrees."""
     try:
         number = float(value)
     except (TypeError, ValueError):

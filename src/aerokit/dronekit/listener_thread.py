@@ -58,13 +58,12 @@ class ListenerThread:
     def call(self, function: Callable[..., object], *args: Any) -> None:
         """Queue a call and wait until it has run, at most two seconds.
 
-        On this listener thread, and after :meth:`stop`, the function is called directly. On the thread of an event
-        loop or of another listener, this method does not wait.
+        On this thread, or after :meth:`stop`, call the function directly. On an event loop or another listener thread,
+        only queue the call, because a wait could cause a deadlock.
         """
         if self.is_current or self.is_stopped:
             function(*args)
             return
-        # On these threads, a wait could cause a deadlock.
         if _must_not_wait():
             self.post(function, *args)
             return

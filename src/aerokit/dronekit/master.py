@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
-# Messages are stored from the first access on. For this time after the first access, a look-up waits for a message that
-# has not arrived yet.
+# Messages are stored from the first access on. For this long, a look-up then waits until its message arrives.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
 
@@ -189,10 +188,9 @@ class Master:
     ) -> Any:
         """Return the next message of the given types (None: any) that satisfies pymavlink's ``condition``.
 
-        From the first call on, messages are stored: the last 1,000, each for at most five seconds. If none matches,
-        returns None at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises
-        APIException if no stored message matches and the connection is closed, or if it would have to wait on the event
-        loop's own thread.
+        From the first call on, the last 1,000 messages are stored, each for at most five seconds. If none of them
+        matches, return None or, if ``blocking``, wait for ``timeout`` seconds (None: no limit). In both cases, raise
+        APIException if the connection is closed. Waiting on the event loop's own thread also raises APIException.
         """
         types = (type,) if isinstance(type, str) else type
         names = None if types is None else set(types)
@@ -211,7 +209,7 @@ class Master:
         return getattr(self.messages.get(type), field, default)
 
     def time_since(self, mtype: str) -> float:
-        """Return the seconds since the last message of a type; before the first, since ``messages`` was first used."""
+        """Return the seconds since the last message of a type, or since the first access if there was none."""
         return self.messages.age_s(mtype)
 
     def param(self, name: str, default: float | None = None) -> float | None:
@@ -230,7 +228,7 @@ class Master:
         fix = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
         self.recv_match(type="VFR_HUD", blocking=True)  # As in pymavlink, the altitude is from VFR_HUD.
         self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
-        # The messages that were waited for may have been stored for seconds, so the last ones are used.
+        # The matching messages may be seconds old, so use the latest ones.
         gps, hud, position = map(self.messages.__getitem__, ("GPS_RAW_INT", "VFR_HUD", "GLOBAL_POSITION_INT"))
         if gps.fix_type < 3:  # The fix was lost meanwhile.
             gps = fix
@@ -257,8 +255,8 @@ class Master:
 class Inbox(Mapping[str, Any]):
     """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    Reception starts with the first access. Look-ups in the first second after that wait for their message. Messages of
-    radios and ground stations are included, but not those of other vehicles.
+    Messages are stored from the first access on. A look-up in the first second waits until the message arrives.
+    Messages of radios and ground stations are included, but not those of other vehicles.
     """
 
     def __init__(self, connection: ClassicConnection) -> None:
@@ -281,7 +279,7 @@ class Inbox(Mapping[str, Any]):
         return None
 
     def age_s(self, name: str) -> float:
-        """Return the seconds since the last message of this type or, before the first, since the first use."""
+        """Return the seconds since the last message of this type, or since the first access if there was none."""
         self._start()
         frame = self._latest.get(_id_of(name))
         if frame is None:
@@ -292,7 +290,7 @@ class Inbox(Mapping[str, Any]):
         self._start()
         message_id = _id_of(name)
         while (frame := self._latest.get(message_id)) is None and self._may_wait():
-            self._arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # It is short, so that `_may_wait` ends the loop in time.
+            self._arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # short, so that `_may_wait` ends the loop in time
         if frame is None:
             raise KeyError(name)
         return message_of(frame)

@@ -45,8 +45,8 @@ MAX_OPEN_ATTEMPTS, RETRY_INTERVAL_S = 3, 1.0
 class MAVConnection(ClassicConnection):
     """An open link to a vehicle, with an event loop on a separate thread.
 
-    ``ip`` is a connection string of DroneKit, pymavlink (a bare ``host:port`` and ``udp:`` listen) or aerokit. A lost
-    link is reopened. ``use_native`` is ignored.
+    ``ip`` is a connection string of DroneKit, pymavlink or aerokit. As in pymavlink, a bare ``host:port`` and ``udp:``
+    listen. A lost link is reopened. ``use_native`` is ignored.
 
     Raises:
         OSError: the link cannot be opened: ConnectionRefusedError, socket.gaierror, serial.SerialException …
@@ -138,8 +138,8 @@ class MAVConnection(ClassicConnection):
 
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
-        # Tests of programs set this to False, which discards received bytes, to simulate a silent link.
-        # The link calls `bytes_received` with received bytes. An instance attribute of this name hides the method.
+        # Tests of programs set this to False to simulate a silent link. Received bytes are then discarded: an instance
+        # attribute hides the method `bytes_received`, which the link calls.
         if value:
             vars(self.connection).pop("bytes_received", None)
         else:
@@ -193,7 +193,7 @@ _created_connections: ContextVar[weakref.WeakSet[MAVConnection] | None] = Contex
 
 @contextlib.contextmanager
 def created_connections() -> Iterator[weakref.WeakSet[MAVConnection]]:
-    """Collect the connections that this thread creates in the block."""
+    """Collect the connections that this thread creates in the ``with`` block."""
     connections: weakref.WeakSet[MAVConnection] = weakref.WeakSet()
     token = _created_connections.set(connections)
     try:

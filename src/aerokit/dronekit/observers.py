@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("dronekit")
 
 AttributeListener = Callable[[Any, str, Any], object]
-"""Called as ``listener(object, name, value)``; the value is that of an attribute, or a message of pymavlink."""
+"""Called as ``listener(object, name, value)``. The value is an attribute's value, or a message of pymavlink."""
 
 ListenerT = TypeVar("ListenerT", bound=AttributeListener)
 
@@ -36,9 +36,9 @@ _registration_lock = threading.Lock()  # shared by all objects, for adding and r
 class Listeners:
     """The listeners of an object, by the name of the attribute or message. Can be used from any thread.
 
-    Listeners run on the listener thread, in the order of the values. For each value, the listeners of its name run
-    before those of ``'*'``. Listeners may block, raise exceptions and remove themselves. Without a listener thread they
-    run on the notifying thread. ``on_value(name)`` is called for every value, with or without listeners.
+    Listeners run one after the other on the listener thread or, without one, on the notifying thread. The listeners of
+    a name run before those of ``'*'``. Listeners may block, raise exceptions and remove themselves. ``on_value(name)``
+    is called for every value, with or without listeners.
     """
 
     kind = "attribute"  # the word for a name in log messages
@@ -100,7 +100,7 @@ class Listeners:
             self._thread.post_or_drop(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """Like :meth:`notify` with the owner's attribute, which is read only if it has listeners."""
+        """Call the listeners with the value of the owner's attribute. Without listeners, it is not read."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:
@@ -157,7 +157,7 @@ class HasObservers:
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Remove a listener. Ignored if the name has no listeners; ValueError if it has only others."""
+        """Remove a listener. Ignored if the name has no listeners; ValueError if this listener is not among them."""
         self._dk_listeners.remove(self._dk_normalized(attr_name), observer)
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:

@@ -39,8 +39,8 @@ VERSION_TIMEOUT_S = 1.0
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-# An attempt to set a parameter takes ROUND_TRIPS round trips of the link, at least MIN_ATTEMPT_S. After the last
-# attempt, the answer is awaited for LAST_WAIT_SHARE of an attempt's time.
+# An attempt to set a parameter may take ROUND_TRIPS round trips of the link, but at least MIN_ATTEMPT_S. For the last
+# attempt, this time is multiplied by LAST_WAIT_SHARE.
 MIN_ATTEMPT_S, ROUND_TRIPS = 1.0, 3
 LAST_WAIT_SHARE = 0.5
 
@@ -48,7 +48,7 @@ ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an 
 
 
 class ParameterDownload:
-    """Downloads the parameters once the vehicle is connected. A failure is logged once, as a warning.
+    """Downloads the parameters after the vehicle has connected. Only the first failure is logged, as a warning.
 
     A failed download is repeated only while a program waits for parameters.
     """
@@ -76,7 +76,7 @@ class ParameterDownload:
     async def wait_for(self, name: str) -> None:
         """Wait until the parameter is received, or reported as missing by the vehicle.
 
-        Also returns if a vehicle that has sent the list does not answer, or if the connection ends.
+        Also returns if the connection ends, or if the vehicle does not answer after a complete download.
         """
         # A vehicle may leave a parameter out of the list, so it is requested once.
         if self.is_complete:
@@ -138,7 +138,7 @@ async def _download(
         return
     except AerokitError as error:
         on_failure(error)
-        # The pause limits the attempts, because a waiting program starts the next download as soon as this one ends.
+        # A waiting program starts the next download as soon as this one ends, so a pause limits the attempts.
         await anyio.sleep(RETRY_DELAY_S)
     finally:
         on_ended()
@@ -233,12 +233,13 @@ WAIT_TIMEOUT_S = 30.0
 class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers):
     """Maps names to values: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
-    Names are converted to upper case; values are floats. All parameters are downloaded in the background after
-    connecting. They are not downloaded again after a reboot or a lost link; changes that the vehicle reports are
-    included. Reading a missing value requests only that value; iterating waits for the whole list. :func:`len` returns
-    the number received so far.
+    Names are converted to upper case; values are floats. Old and new names of parameters that ArduPilot renamed both
+    work; values are converted, and a warning is logged.
 
-    Old and new names of parameters that ArduPilot renamed both work; values are converted, and a warning is logged.
+    All parameters are downloaded in the background after connecting, but not again after a reboot or a lost link.
+    Changes that the vehicle reports are included. Reading a missing value requests only that value; iterating waits for
+    the whole list. :func:`len` returns the number received so far.
+
     Listeners are called as ``listener(parameters, name, value)`` when a value is new or has changed. Methods that wait
     raise APIException while the link is down, and TimeoutError after 30 seconds.
     """
@@ -352,7 +353,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return attr_name.upper()
 
     def _find(self, name: object, *, waits: bool = True) -> ResolvedParameter | None:
-        """Look up a parameter by name. With ``waits``, request it if it may still be unknown."""
+        """Look up a parameter by name. With ``waits``, request a missing one, unless all were received."""
         if not isinstance(name, str):
             return None
         name = name.upper()

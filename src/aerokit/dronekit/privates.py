@@ -17,8 +17,8 @@ HEARTBEAT_TIMEOUT_S = 5.0  # DroneKit reports a link time-out after this many se
 class OverridableProperty(Generic[T]):
     """A property that an instance attribute of the same name overrides.
 
-    Used for names to which a program's subclass of Vehicle may assign its own attributes: those that DroneKit 2.9 does
-    not have, and its private ones.
+    Used for private names of DroneKit 2.9, and for names that it does not have: a program's subclass of Vehicle may
+    assign its own attributes to them.
     """
 
     def __init__(self, getter: Callable[[Any], T]) -> None:
@@ -51,7 +51,7 @@ def _velocity(index: int) -> OverridableProperty[Any]:
 
 
 def _message_fields(latest_message: str, *fields: str) -> tuple[OverridableProperty[Any], ...]:
-    """Return properties for fields of the vehicle's LatestMessage with this name."""
+    """Return properties for message fields. ``latest_message`` names an attribute that is a `LatestMessage`."""
     return tuple(attribute_path(f"{latest_message}.message.{field}") for field in fields)
 
 

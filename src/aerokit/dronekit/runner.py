@@ -116,7 +116,7 @@ def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> N
 
     The program finds the environment of ``python program.py arguments…``: ``sys.argv``, its folder first in
     ``sys.path``, and ``__name__ == '__main__'``. A folder or zip file with a ``__main__.py`` is a program, too. At the
-    end ``sys`` is restored, and open vehicles are closed; ``import dronekit`` continues to import
+    end, ``sys`` is restored, and open vehicles are closed. ``import dronekit`` continues to import
     :mod:`aerokit.dronekit`.
 
     Args:

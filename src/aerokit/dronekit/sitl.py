@@ -58,7 +58,7 @@ class ServedVehicle:
         self._thread = threading.Thread(target=self._run, name="aerokit simulated vehicle", daemon=True)
         self._thread.start()
         if not self._startup_ended.wait(START_TIMEOUT_S):
-            self._loop.call_soon_threadsafe(self._stop_requested.set)  # A late start ends at once.
+            self._loop.call_soon_threadsafe(self._stop_requested.set)  # ends the thread if it starts later
             raise LinkOpenError(f"the simulated vehicle has not started within {START_TIMEOUT_S:g} s")
         self._raise_error()
 

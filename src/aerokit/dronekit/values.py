@@ -19,7 +19,7 @@ VEHICLES = {1: "Plane", 2: "Copter", 10: "Rover"}
 
 
 class _Value:
-    """Base class of values whose text is that of DroneKit."""
+    """Base class of values with the same ``str()`` as in DroneKit."""
 
     _text: str  # format string, which gets the object as its argument
 

@@ -260,15 +260,14 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving, in the loop iteration in which the vehicle was found."""
+        """Start receiving. Called on the loop as soon as the vehicle is found, so that no message is missed."""
         core = self._dk
         core.start_receiving(aio, tasks)
         self._handler.vehicle = self
         self._handler.note_sent = aio.note_sent
         self._handler.calls.describe = self._dk_describe
-        # The event loop keeps these callbacks, so they have only weak references to this vehicle. It can then be
-        # garbage collected when the program drops it. `_handler` may have strong ones, because it belongs to this
-        # vehicle.
+        # The event loop keeps these callbacks, so weak references let the vehicle be garbage collected. `_handler` may
+        # have strong ones, because it belongs to this vehicle.
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
         aio._session.on_reboot.append(weak_callback(self._dk_forget_home))
         # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.
@@ -324,7 +323,7 @@ async def _connected(
             # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
             rate_hz = min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0
         try:
-            # `begin` is a weak callback, because the loop keeps it until the connection ends.
+            # `begin` is a weak callback, so that this coroutine does not keep the vehicle alive.
             begin(aio, tasks)
             with nullcontext() if rate_hz is None else aio.streams(rate_hz):
                 yield aio

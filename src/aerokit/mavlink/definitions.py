@@ -126,7 +126,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum. Its entries are those of one XML file or, if `merged_enums` created it, those of all files."""
+    """One enum, as one XML file defines it, or with the entries of all files (`merged_enums`)."""
 
     name: str
     entries: tuple[EntryDefinition, ...]
@@ -225,8 +225,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
             if first is None:
                 merged[enum.name] = enum
                 continue
-            # The enum itself is that of the first file.
-            # An entry in a later file replaces an entry with the same name.
+            # Everything but the entries is from the first file. Of entries with the same name, the last one is used.
             entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
             ordered = sorted(entries.values(), key=lambda entry: entry.value)
             merged[enum.name] = replace(first, entries=tuple(ordered))
@@ -276,7 +275,7 @@ def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinitio
     # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
-        raise ValueError(f"unknown field type {node.attrib['type']!r}")
+        raise ValueError(f"{message}: unknown field type {node.attrib['type']!r}")
     type_, array_length = match[1], int(match[2] or 0)
     return FieldDefinition(
         name=_identifier(node.attrib["name"]),
@@ -373,14 +372,13 @@ def _remarks(node: Element) -> tuple[str, ...]:
 
 
 def _common_prefix(enum: str, names: list[str]) -> str:
-    """Return the enum's name if most entries begin with it, else the words with which all begin."""
+    """Return the enum's name if most entries begin with it, otherwise the words that all entries begin with."""
     if not names:
         return ""
     enum_prefix = enum + "_"
     if sum(name.startswith(enum_prefix) for name in names) * 2 > len(names):
         return enum_prefix
-    # The last word of an entry is never part of the prefix. If there is only one entry, it is compared with the enum's
-    # name instead of with other entries.
+    # The last word of an entry is never part of the prefix. A single entry is compared with the enum's name.
     split_names = [name.split("_")[:-1] for name in names]
     if len(names) == 1:
         split_names.append(enum.split("_"))

@@ -117,8 +117,7 @@ class Dialect:
         return self._decoders[frame.message_id](frame.body, frame)
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
-        # The class is loaded at the first decoding. This function then replaces itself by the decoder of the class, so
-        # that `decode` need not check each time whether the class is loaded.
+        # Replace this function by the class's decoder, so that `decode` need not check whether the class is loaded.
         decoder = self._decoders[message_id] = decoder_of(self[message_id])
         return decoder(body, frame)
 

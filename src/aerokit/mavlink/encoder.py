@@ -58,11 +58,12 @@ class FrameEncoder:
     def encode(self, message: Message, now: float = 0.0) -> bytes:
         """Encode a whole frame.
 
-        MAVLink 2 truncates trailing zeros of the payload. MAVLink 1 omits extension fields and has no ids above 255.
+        In MAVLink 2, trailing zeros of the payload are truncated. In MAVLink 1, extension fields are omitted.
         ``now`` is in seconds since 1970, for the timestamp of the signature.
 
         Raises:
-            InvalidArgument: a field has an invalid value, or MAVLink 1 has no such id. The sequence number stays.
+            InvalidArgument: a field has an invalid value, or the id is above 255 in MAVLink 1. The sequence number is
+                not increased.
         """
         signing = self.signing if self._version == 2 else None
         flags = 0 if signing is None else SIGNED
@@ -72,7 +73,7 @@ class FrameEncoder:
             if compiled is not None:
                 self.sequence = (self.sequence + 1) & 0xFF
                 return compiled if signing is None else compiled + signing.sign(compiled, now)
-            # The result is None until this type has a layout. The layout is made now, for the next message.
+            # Compiled code cannot encode this type yet. Make its layout, for the next message.
             layout_of(type(message))
         payload = message.encode()
         message_id = message.ID

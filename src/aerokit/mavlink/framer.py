@@ -49,9 +49,10 @@ _NOISE = 5
 # Position of a valid frame, and parts of its header: (begin, end, message id, sequence number, source).
 _ValidFrame = tuple[int, int, int, int, int]
 
-# What is known about the data that is kept: (position up to which it was examined, candidates for frames, positions of
-# bad checksums). A candidate is (begin, verdict, data size at which to examine it again). Without this state, all kept
-# bytes would be examined again with each further byte.
+# What is known about the kept data, so that it is not examined again with each further byte:
+# - the position up to which it was examined;
+# - the candidates for frames: (begin, verdict, size of the data at which to examine the candidate again);
+# - the positions of bad checksums.
 _ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
 _NEW_SCAN: _ScanState = (0, [], [])
 
@@ -82,7 +83,7 @@ class PythonFramer:
         self._sources = self.statistics.by_key
 
     def receive(self, data: bytes, now: float = 0.0) -> list[Frame]:
-        """Return the wanted frames that ``data`` completes, in order. ``now`` becomes their ``received_at``."""
+        """Return the frames of wanted messages that ``data`` completes, in order. Their ``received_at`` is ``now``."""
         # This loop is long and duplicates `_examine` deliberately, because it runs for every frame. Anything but a
         # valid MAVLink 2 frame of a known message takes the slow path.
         if type(data) is not bytes:
@@ -207,13 +208,13 @@ class PythonFramer:
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
         """Sort the frames that were out of order into :attr:`late` and :attr:`foreign`.
 
-        ``out_of_order`` has the position in ``frames``, the result of `SourceStatistics.out_of_order`, and the
-        sequence and sender.
+        An entry of ``out_of_order`` has the position of a frame in ``frames``, the result of
+        `SourceStatistics.out_of_order`, and the frame's sequence number and sender.
         """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
-                # An unwanted message is not in `frames`, so a later frame may be at its position.
+                # Unwanted frames are not in `frames`, so another frame may be at this position.
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
                     continue
                 if ordering == OTHERS:
@@ -227,17 +228,17 @@ class PythonFramer:
         """Return the next valid frame from ``begin`` on, or None. Keep data that may become a frame in ``_rest``."""
         size = len(data)
         keep_from = -1  # position from which data is kept
-        unknown_begin = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame
+        unknown_begin = unknown_end = -1  # position of what may be a frame of an unknown message; -1 if there is none
         examined_to, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
-        # A new candidate is examined at once, because its end is 0. Until then it counts as noise.
+        # These verdicts are placeholders: a candidate with an end of 0 is examined at once.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)
         for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
-                # No valid frame was found inside the unknown frame. It counts as a frame if another one may follow it.
+                # The unknown frame contains no valid frame. It is accepted if a frame or the end of the data follows.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._count_skipped(begin, unknown_begin, bad_crcs)
                     self._skip_unknown(data, unknown_begin, unknown_end)
@@ -248,7 +249,7 @@ class PythonFramer:
                 unknown_begin = -1
             if position >= size:
                 break
-            # Examine the candidate if enough data has arrived. An unknown frame was whole when it was examined.
+            # Examine the candidate if enough data has arrived. Further data does not change the verdict `_UNKNOWN`.
             if end <= size and verdict != _UNKNOWN:
                 verdict, end, frame = self._examine(data, position)
                 if verdict == _GOOD:
@@ -300,7 +301,10 @@ class PythonFramer:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
-        """Return the verdict, the end, and the frame if it is valid, for the magic byte at ``begin``."""
+        """Examine a possible frame at ``begin``.
+
+        Return the verdict, the end of the frame (of its header, if that is incomplete), and the frame if it is valid.
+        """
         size = len(data)
         if data[begin] == MAGIC_V2:
             if size - begin < 3:  # The flags have not arrived yet.
@@ -338,7 +342,7 @@ class PythonFramer:
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
     """Return the earliest of three candidates for the beginning of a frame. The first two may be missing (-1)."""
-    if unknown_begin >= 0:  # `unknown_begin` is set only while `keep_from` is missing, so it is earlier.
+    if unknown_begin >= 0:  # `_search` sets `unknown_begin` only before `keep_from`.
         return unknown_begin
     return position if keep_from < 0 else keep_from
 

@@ -67,14 +67,14 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
         existing = merged.get(added.name)
         if existing is not None:
             entries = _merged_entries(existing, added)
-            # New entries do not change the Python names of existing ones, which depend on the prefix.
+            # Keep the prefix, because the Python names of the existing entries depend on it.
             added = _with_first_origin(replace(existing, entries=entries, own_prefix=existing.prefix), added)
         merged[added.name] = added
     return list(merged.values())
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that `STANDARD_FILES` lists first."""
+    """Return ``existing`` with the first of both origins in `STANDARD_FILES`, and the remarks of ``added``, if any."""
     origin = min(
         existing.origin,
         added.origin,
@@ -88,7 +88,7 @@ def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tup
     for field in added.fields:
         existing_field = fields.get(field.name)
         if existing_field is not None:
-            # Units, enum and invalid value are those of the addition, even if empty.
+            # The addition replaces the units, enum and invalid value, even by empty ones.
             field = replace(existing_field, units=field.units, enum=field.enum, invalid=field.invalid)
         fields[field.name] = field
     return tuple(fields.values())
@@ -99,7 +99,7 @@ def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[En
     merged = {entry.name: _merged_entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
         merged.setdefault(name, entry)
-    # Sorting is stable, so the additions, which are first in `merged`, stay first among several names for one value.
+    # Sorting is stable, so of several names for one value, the added names stay first.
     return tuple(sorted(merged.values(), key=lambda entry: entry.value))
 
 
@@ -262,7 +262,7 @@ def xml_folder() -> Path:
     """Return the folder with the XML files of the installed pymavlink."""
     spec = importlib.util.find_spec("pymavlink")
     if spec is None or not spec.submodule_search_locations:
-        raise InvalidArgument("pymavlink is not installed; its package contains the XML files")
+        raise InvalidArgument("the package pymavlink, which contains MAVLink's XML files, is not installed")
     return Path(spec.submodule_search_locations[0]) / "dialects" / "v20"
 
 

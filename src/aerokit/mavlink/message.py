@@ -29,7 +29,7 @@ MessageT = TypeVar("MessageT", bound="Message")
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
 # (message, field) of ``char`` arrays that carry a number or a text, depending on another field. They are decoded as
-# bytes, because a string ends at the first NUL, so that a number would be truncated.
+# bytes, because a text would end at the first zero byte of a number.
 BYTES_IN_CHARS = frozenset((name, "param_value") for name in ("PARAM_EXT_VALUE", "PARAM_EXT_SET", "PARAM_EXT_ACK"))
 # Fields whose values are secret, and therefore never appear in texts.
 SECRET_FIELDS = frozenset(("secret_key", "passkey", "password"))
@@ -169,7 +169,7 @@ def _wire_fields(message_type: type[Message]) -> list[Field]:
 
 
 def layout_of(message_type: type[Message]) -> Any:
-    """Return the layout for compiled code, or None if the class has none. It is created on first use."""
+    """Return the description of the fields for compiled code; None if compiled code cannot be used for this class."""
     own_attributes = message_type.__dict__  # without the attributes of base classes, whose layout would be wrong
     if "_LAYOUT" not in own_attributes:
         is_generated = {"_FIELDS", "decode_body", "encode"} <= own_attributes.keys()
@@ -324,7 +324,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
     """Explain why a value does not fit into this type, or return None."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
-        try:  # 64 bits are enough for each kind, whose range is checked below. Other values are no integers, or huge.
+        try:  # This finds values that are not integers. The range of the kind is checked below.
             struct.pack("<q" if low < 0 else "<Q", value)
         except (struct.error, OverflowError, TypeError):
             if not hasattr(value, "__index__"):

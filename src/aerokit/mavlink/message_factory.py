@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from aerokit.errors import InvalidArgument
 
-if TYPE_CHECKING:  # This class has looser annotations than pymavlink's, which are stricter than its behaviour.
+if TYPE_CHECKING:  # pymavlink's own annotations are stricter than its behaviour.
 
     class _MAVLink:
         total_packets_sent: int
@@ -27,10 +27,11 @@ else:
 class MessageFactory(_MAVLink):
     """Provides ``<message>_encode(…)``, which returns a pymavlink message, and ``<message>_send(…)`` for every message.
 
-    The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2. Further messages of the program's dialect
-    (``mavutil.mavlink``) are created by that dialect. Values are only checked on sending. Strings may be ``str`` or
-    bytes. Use :func:`from_pymavlink` to convert messages, which also rounds numbers for integer fields:
-    ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message, vehicle.system_id)), 255, 0)``.
+    The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2, and further messages of the program's
+    dialect (``mavutil.mavlink``). Strings may be ``str`` or bytes. Values are only checked on sending.
+
+    This factory sends with aerokit: ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message,
+    vehicle.system_id)), 255, 0)``. The conversion also rounds numbers for integer fields.
     """
 
     seq: int

@@ -30,9 +30,9 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
     """Convert a message to one of aerokit, for ``vehicle.send``. The result is a validated copy.
 
     Args:
-        message: a pymavlink message of any dialect, for MAVLink 1 or 2; or any object with ``get_type()`` and the
-            fields of a standard message as attributes; or a message of aerokit. Numbers in integer fields are rounded.
-            Strings may be ``str`` (sent as UTF-8) or bytes. Missing extension fields are 0.
+        message: a pymavlink message of any dialect, for MAVLink 1 or 2, or a message of aerokit. Any other object must
+            have ``get_type()`` and, as attributes, the fields of a standard message. Numbers in integer fields are
+            rounded. Strings may be ``str`` (sent as UTF-8) or bytes. Missing extension fields are 0.
         target_system: new value of the field ``target_system``, if the message has this field. It is also assigned to
             ``message`` itself, unless that is a message of aerokit. None and 0 leave the field unchanged.
             ``target_component`` is never changed.
@@ -194,8 +194,8 @@ class _RawText(str):
         return self._data
 
 
-# pymavlink dialects in which a message class is searched if the program's dialect has none. Together they have all
-# messages of STANDARD.
+# pymavlink dialects to search for a message that the program's dialect does not have. Together, they have all messages
+# of STANDARD.
 DIALECTS = ("ardupilotmega", "development")
 
 CHECKSUM_LENGTH = 2
@@ -211,11 +211,12 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
     Args:
         frame: a received frame: ``message.received_frame``, or the argument of a frame observer.
-        dialect: pymavlink module that is tried first, if it is for MAVLink 2. Then pymavlink's ardupilotmega and
-            development for MAVLink 2 are tried. The first module that has the message decodes it, with its extension
-            fields. A module that contradicts the CRC_EXTRA of a standard message is skipped. If no module has the
-            message, or the checksum is wrong, the result is a ``MAVLink_unknown`` with type ``UNKNOWN_<id>``.
+        dialect: pymavlink module for MAVLink 2, which is tried before pymavlink's ardupilotmega and development. The
+            first module that has the message decodes it. Modules with another CRC_EXTRA than the standard are skipped.
         timestamp: ``_timestamp`` of the message: in pymavlink, seconds since 1970.
+
+    Returns:
+        The message. If no module has it, or its checksum is wrong: a ``MAVLink_unknown`` of type ``UNKNOWN_<id>``.
     """
     return _decoder(frame.message_id, dialect)(frame, timestamp)
 
@@ -276,9 +277,9 @@ class _Layout:
 
     def __init__(self, message_class: Any) -> None:
         zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
-        # Attribute names in wire order. For a text field, it is the name of the attribute with the raw bytes.
+        # The attributes in wire order; for a text field, the attribute with the raw bytes.
         self.names: list[str] = []
-        # For each field, the position of its first value and the number of its values; empty if there are no arrays.
+        # The position and the number of each field's values; empty if there are no arrays.
         self.arrays: list[tuple[int, int]] = []
         self.texts: list[tuple[str, str]] = []  # for each text field, its name and the name of its raw bytes
         position = 0

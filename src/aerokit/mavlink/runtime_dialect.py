@@ -33,7 +33,7 @@ LoadedDialect = tuple[str, list[type[Message]], dict[str, type[Any]]]
 
 
 class Standard(Protocol):
-    """Interface of the dialect with the generated messages, which are reused where definitions are the same."""
+    """Interface of the dialect of generated messages. Other dialects reuse its classes for the same messages."""
 
     rows: dict[int, tuple[int, int, int]]
 

@@ -150,13 +150,12 @@ class Signing:
                 different link ids.
             timestamp: the last value of :attr:`timestamp` with this key (10 µs since 2015), for computers whose clock
                 may be wrong. A later time of the clock takes precedence.
-            allow_unsigned: a function that returns True for a frame to accept it without a valid signature, for example
-                from a camera without a key. Anyone can send such frames. None accepts only RADIO_STATUS, which
-                telemetry radios send.
+            allow_unsigned: called with each frame without a valid signature; returns True to accept it, for example
+                from a camera without a key. Anyone can send such frames. RADIO_STATUS and RADIO, which telemetry radios
+                send, are always accepted.
             keep: a file that stores the timestamp, so that a restarted program refuses frames from before the restart.
-                Each key needs a separate file, and two programs must not use one file at the same time. The stored
-                timestamp is up to half a minute in the future, so the file is written at most twice a minute. Each
-                time, it is replaced atomically.
+                Each key needs a separate file, and two programs must not use one file at the same time. The file is
+                replaced atomically, at most twice a minute. Its timestamp is up to half a minute in the future.
 
         Raises:
             InvalidArgument: a number is out of range, or ``key`` is not a SigningKey.
@@ -272,7 +271,7 @@ class Signing:
         return None
 
     def _store_timestamp(self, stream: tuple[int, int, int], timestamp: int) -> None:
-        # A stream that is removed here counts as new at its next frame, whose timestamp is then compared with ours.
+        # The next frame of a removed stream is checked like that of a new sender: only against our own timestamp.
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
             del self.streams[min(self.streams, key=self.streams.__getitem__)]
         self.streams[stream] = timestamp
@@ -282,8 +281,8 @@ class Signing:
         # Store the timestamp before using it, so that the next program starts with a later timestamp even after a
         # crash.
         if self._timestamp_file is not None:
-            # After a restart, timestamps are up to half a minute ahead. This is harmless, because receivers accept
-            # other senders that are up to a minute behind.
+            # A restarted program may sign with timestamps half a minute ahead of other senders. Receivers accept a
+            # difference of one minute.
             self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)
         self.timestamp = timestamp
 
@@ -308,8 +307,8 @@ _MAX_LENGTH = 64
 class TimestampFile:
     """A file with a timestamp that is later than all timestamps used so far.
 
-    The constructor raises OSError, or FileFormatError if the file contains anything else. A later error must not end a
-    flight, so it is stored in ``error`` until writing succeeds.
+    The constructor raises OSError, or FileFormatError if the file does not contain a timestamp. Later errors must not
+    end a flight, so :meth:`reserve` stores them in ``error``.
     """
 
     def __init__(self, path: str | PathLike[str], maximum: int) -> None:
@@ -324,7 +323,7 @@ class TimestampFile:
         """Ensure that the stored timestamp is later than ``timestamp``. If not, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
-        # Writing may block the event loop, so the next attempt follows only at this time, even after a failure.
+        # This also delays the next attempt after a failure, because writing may block the event loop.
         self.timestamp = min(timestamp + ahead, self._maximum)
         try:
             self._write(self.timestamp)

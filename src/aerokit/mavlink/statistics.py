@@ -26,7 +26,7 @@ class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
     Two senders with the same ids are detected, because their sequence numbers form two streams. Losses are then counted
-    in only one of the streams: in the one with more frames, until it has been silent for 1.5 s.
+    only in the stream with more frames. After it has been silent for 1.5 s, they are counted in the other one.
     """
 
     expected: int
@@ -57,8 +57,8 @@ class SourceStatistics(SourceFields):
     # The following are set when a second stream with the same ids begins.
     _other_count: int  # number of frames of the second stream
     _other_at: float
-    _skipped_over: int  # number of frames counted as lost when the current stream began
-    _returns: int  # number of frames that continue the previous stream
+    _skipped_over: int  # number of frames that count as lost between the two streams
+    _returns: int  # number of frames that have continued the previous stream since then
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id
@@ -67,11 +67,12 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # The first sequence number, plus the steps by which `expected` has advanced without a received frame.
-        # `received` is `expected` minus this number, so a received frame only has to increase `expected`.
+        # `expected` minus `received`. This is stored instead of `received`, so that a frame in sequence increases only
+        # `expected`.
         self._unreceived = sequence
-        self._missing = 0  # bit n is set if the frame n + 1 before `_missing_base` is missing
-        self._missing_base = sequence  # value of `expected` to which `_missing` refers
+        # Missing frames: bit 0 is set if the frame before `_missing_base` is missing, bit 1 for the one before that, …
+        self._missing = 0
+        self._missing_base = sequence
         self._repeated_sequence = -1  # sequence number of the last repeated frame
         self._received_at_repetition = -1  # value of `received` when that frame arrived
         self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
@@ -125,7 +126,7 @@ class SourceStatistics(SourceFields):
 
     def _on_gap(self, ahead: int, now: float) -> None:
         """Process a frame after ``ahead`` missing frames."""
-        # A frame that arrives late is subtracted again.
+        # If a missing frame arrives late, it is subtracted again.
         self.lost += ahead
         if ahead > _MAX_GAP:  # The frame may belong to another stream.
             self._begin_stream(now)
@@ -137,7 +138,7 @@ class SourceStatistics(SourceFields):
         self._missing_base = self.expected
 
     def _begin_stream(self, now: float) -> None:
-        # The position of the previous stream is kept for a while, because that stream may continue.
+        # Remember where the previous stream stopped, because it may continue.
         self._other_expected = self.expected & 0xFF
         self._other_count = self.received - self._stream_start
         self._other_at = now
@@ -145,12 +146,12 @@ class SourceStatistics(SourceFields):
         self._returns = self._skipped_over = 0
 
     def _shifted(self, advance: int) -> int:
-        """Return the value that `_missing` has if `_missing_base` is `expected` + ``advance``."""
+        """Return the bits of `_missing` for a `_missing_base` of `expected` + ``advance``."""
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _consume_missing(self, behind: int) -> bool:
-        """Clear the bit of `_missing` for the frame ``behind`` numbers before `expected`. Return True if it was set."""
+        """Mark the frame `expected` - ``behind`` as no longer missing. Return True if it was missing."""
         self._missing, self._missing_base = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
@@ -158,21 +159,21 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        """Process a frame that is older than `expected`, but not lost. Return a result of :meth:`out_of_order`."""
+        """Process an old frame that was not missing. Return a result of :meth:`out_of_order`."""
         # A single old frame is a repetition. Several with consecutive numbers show that the sender rebooted.
         follows = sequence == (self._repeated_sequence + 1) & 0xFF
         is_direct_succession = follows and self._received_at_repetition == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        # A link may repeat two or three recent frames, so a longer run of recent numbers is required. It hardly ever
-        # repeats old frames, so two of them in succession show a reboot.
+        # Four recent frames in succession are required, because a link may repeat two or three. It hardly ever repeats
+        # older frames, so two of these are enough.
         min_run = 3 if is_near else 1
         if self._late_run >= min_run:
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # Repeated frames whose numbers follow each other may come from a second sender, so they count as alternations
-        # between two streams. Any other repeated frame resets the count.
+        # A frame that follows the last repeated frame may be a second sender's, whose frames alternate with these. Any
+        # other repeated frame resets the count.
         if follows:
             self._count_alternation(now)
         else:
@@ -199,16 +200,15 @@ class SourceStatistics(SourceFields):
         self._count_alternation(now)
         if is_other_longer:
             self._returns += 1
-        # The other stream replaces the current one at once if that has timed out, or after `_MIN_RETURNS` frames if
-        # it has more frames than the current one.
+        # If the current stream has timed out, the other stream replaces it at once. Otherwise, only a longer stream
+        # replaces it, after `_MIN_RETURNS` frames.
         if is_over or self._returns >= _MIN_RETURNS:
-            # A shorter stream takes over only because the current one has ended. The count of its frames then starts
-            # again at 0.
+            # The frames of a shorter stream are counted from 0 again.
             other_count = self._other_count if is_other_longer else 0
             self._swap(sequence, now, current_count, other_count)
             return IN_ORDER
         if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
-            # The frame is in the gap before the current stream. The frames of this gap were counted as lost.
+            # The frame is in the gap between the streams, and was counted as lost.
             self.lost -= 1
             self._skipped_over -= 1
         self._other_expected = (sequence + 1) & 0xFF
@@ -216,13 +216,12 @@ class SourceStatistics(SourceFields):
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # The frame does not count as one of the current stream.
-        # The longer stream is the sender's own, so a frame of the longer stream was only overtaken. A frame of the
-        # shorter one is another sender's.
+        # The longer stream is taken for the sender's own, the shorter one for another sender's.
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
-        # The gap before the current stream was no loss, so it is subtracted. Frames of the gap may have arrived late,
-        # so the result could be negative without max().
+        # The gap between the streams was not a loss. max() is needed, because frames of the gap that arrived late are
+        # already subtracted.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
         self._other_count = current_count
@@ -279,8 +278,7 @@ class SourceLimit:
 class FramerStatistics(CounterFields):
     """Counters of one framer.
 
-    Every byte received belongs to a valid frame or a frame of an unknown message, counts as bad, or is still in the
-    buffer.
+    A received byte is part of a frame of a known or unknown message, counts as bad, or is still in the buffer.
     """
 
     unknown_ids: int
@@ -323,10 +321,10 @@ class FramerStatistics(CounterFields):
         """Like :attr:`sources`, but the key is system id + 256 · component id."""
         return self._by_key
 
-    def add_source(self, key: int, sequence: int, may_stay: bool) -> SourceStatistics:
-        """Create the counters of a new sender. If ``may_stay`` is False, the counters are not kept."""
+    def add_source(self, key: int, sequence: int, has_room: bool) -> SourceStatistics:
+        """Create the counters of a new sender. They are stored only if ``has_room`` is True."""
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
-        if may_stay:
+        if has_room:
             self._by_key[key] = source
             self.sources[source.system_id, source.component_id] = source
         else:

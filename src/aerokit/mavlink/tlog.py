@@ -19,9 +19,8 @@ _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
-# After garbage, the search for the next record ignores times before the year 2000, because zeros in the header of a
-# frame look like an early time. Where a record is expected, an early time is accepted, because the computer's clock may
-# have been wrong.
+# While searching for a record after garbage, ignore times before the year 2000: zeros in a frame's header look like
+# such a time. Directly after a record, accept them, because the computer's clock may have been wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
 # If the first two bytes of a time are not larger than these, the time is before _LAST_TIME.
@@ -31,8 +30,8 @@ _MAX_TIME_PREFIX = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]
 def read_tlog(source: str | PathLike[str] | BinaryIO) -> Iterator[tuple[float, bytes]]:
     """Yield the records of a log as (seconds since 1970, whole frame). Checksums are not verified.
 
-    Bytes that are not a record, and a truncated record at the end, are skipped. A file opened by path is closed with
-    the iterator. OSError if the file cannot be read.
+    Bytes that are not a record, and a truncated record at the end, are skipped. A file opened by path is closed when
+    the iterator ends or is closed. OSError if the file cannot be read.
     """
     if isinstance(source, (str, PathLike)):
         with open(source, "rb") as file:
@@ -63,8 +62,8 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
             if records:
                 yield from records
                 continue
-        # A fast path for an unsigned MAVLink 2 frame before another one, in half the time of `_record_end`. A time of
-        # 8 bytes precedes each frame, which has 12 bytes in addition to its payload.
+        # For an unsigned MAVLink 2 frame before another one, this takes half the time of `_record_end`. The record has
+        # 20 bytes in addition to the payload: 8 for the time and 12 for the frame.
         try:
             end = begin + 20 + data[begin + 9]
             if (
@@ -89,7 +88,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
 
 
 def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
-    """Return the end of the record at ``begin``; None if it is incomplete, before ``min_time``, or no true record."""
+    """Return the end of the record at ``begin``; None if it is incomplete, before ``min_time``, or not a record."""
     end = _frame_end(data, begin)
     if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < min_time:
         return None
@@ -99,11 +98,11 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if a true record begins between ``begin`` and ``end``."""
-    # A true record ends after `end`, before another one.
+    """Return True if a record probably begins between ``begin`` and ``end``, instead of at ``begin``."""
     for inside in range(begin + 1, end):
-        true_end = _frame_end(data, inside)
-        if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
+        inside_end = _frame_end(data, inside)
+        # The record that begins inside ends later, and a further record follows it.
+        if inside_end is not None and inside_end > end and _frame_end(data, inside_end) is not None:
             return True
     return False
 

@@ -53,8 +53,9 @@ FLIGHT = (
 """Columns of the flight table after the time and the system id. A row has the newest values at one position."""
 
 
-# Matches the places where spreadsheets may recognise a formula (owasp.org/www-community/attacks/CSV_Injection): before
-# an operator at the beginning of a text or after a separator of another locale, and before a leading control character.
+# Matches the places where spreadsheets may recognise a formula (owasp.org/www-community/attacks/CSV_Injection):
+# - before an operator at the beginning of the text, or after ";" or a tab, which are separators in some locales;
+# - before a control character at the beginning of the text.
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
@@ -168,7 +169,7 @@ _MakeRow = Callable[["LogRecord"], Sequence[Any]]
 
 
 class FlightTableWriter:
-    """Writes one table, with a row for each position of each vehicle. The other columns have the newest values."""
+    """Writes one table, with a row for each position of each vehicle, and the values of other states at that time."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._table = kind(path, (*_SENDER_COLUMNS[:2], *FLIGHT))
@@ -203,7 +204,7 @@ class MessageTablesWriter:
         self._path, self._log, self._kind = path, log, kind
         log.needs_states = False
         self._tables: list[Table] = []
-        # Maps each record type to the function that adds a row to its table, and the one that makes a record's row.
+        # For each record type: a function that adds a row to its table, and one that converts a record to a row.
         self._converters: dict[str, tuple[_AddRow, _MakeRow]] = {}
         self.written: int = 0
 

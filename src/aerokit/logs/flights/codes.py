@@ -112,7 +112,7 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# Subsystems whose error code is not the number of an error, but the value in the comment.
+# For these subsystems, the error code has another meaning, which is in the comment.
 _MODE_CHANGE = 10  # number of the refused mode
 _ESTIMATOR_SWITCH = 24  # number of the new estimator
 _FENCE = 9  # bits of AC_FENCE_TYPE
@@ -173,7 +173,7 @@ _ROVER_BATTERY = ("none", "RTL", "HOLD", "SMART_RTL", "SMART_RTL or HOLD", _STOP
 _PLANE_BATTERY = ("none", "RTL", "LAND", _STOPS, "QLAND", "parachute", "LOITER, then QLAND", "AUTOLAND or RTL")
 _SUB_BATTERY = ("none", "", "disarms", "SURFACE")
 _BATTERY = ("BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT")
-# Maps firmwares and parameters of failsafes to the meanings of the values, from 0. Sources: AP_BattMonitor_Params.cpp,
+# Maps firmwares and failsafe parameters to descriptions of the values 0, 1, 2, … Sources: AP_BattMonitor_Params.cpp,
 # AC_Fence.cpp and Parameters.cpp of ArduPilot 4.7, commander and navigator parameters of PX4 1.17.
 _ACTIONS: dict[str, dict[str, tuple[str, ...]]] = {
     "ArduCopter": {

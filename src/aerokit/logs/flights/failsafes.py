@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe, or a warning: evidence of a problem without a reaction that is certainly the autopilot's."""
+    """A failsafe or, if ``acted`` is False, a warning: a problem without a certain reaction of the autopilot."""
 
     time_s: float
     kind: str
@@ -91,7 +91,7 @@ _ACTION_PATTERN = re.compile(
 )
 
 _PX4_PREFIXES = ("BAT_", "COM_", "FD_", "GF_", "NAV_")
-# Maps kinds of failsafes to the parameters that define when the failsafe triggers, and its action.
+# Maps kinds of failsafes to the parameters for their limits and actions.
 _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
     "battery": (
         *("BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER", "BATT_LOW_MAH", "BATT_CRT_MAH"),

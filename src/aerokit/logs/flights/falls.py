@@ -58,14 +58,14 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    A descent counts if the vehicle sank 2 m or more at 3 m/s or more, was stopped within 0.6 s (or 1.5 intervals of
-    the logged velocities), and one of these is true:
+    A descent is a candidate if the vehicle sank 2 m or more, at 3 m/s or more. It counts if it stopped within 0.6 s (or
+    1.5 intervals of the logged velocities), and one of these is true:
 
-    - The vehicle was disarmed within 30 s, and no logged height shows that it had climbed or sunk again before.
-    - It stopped at most 3 m above home, and no logged height of the next 30 s shows that it climbed or sank again.
+    - The vehicle was disarmed within 30 s. No logged height shows that it climbed or sank again before.
+    - It stopped at most 3 m above home. No logged height of the next 30 s shows that it climbed or sank again.
     - The log has evidence of a fall: see `Fall.reasons`.
 
-    A descent that is not over when the log ends counts with such evidence, or if the vehicle would have reached home's
+    If the log ends during the descent, it counts if there is such evidence, or if the vehicle would have reached home's
     height within 2 s.
     """
     if not flight.armed:
@@ -78,9 +78,9 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
-    """Yield each fast descent that stops abruptly, or that lasts until the log ends.
+    """Yield each fast descent that ends abruptly, or with the log.
 
-    The values are its start and end, its highest sink rate near the end, and True if it stopped.
+    The values are its start and end, its highest sink rate near the end, and False if it ended with the log.
     """
     begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
     last_fast_s = -math.inf  # the last time at which it sank fast
@@ -132,7 +132,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if all heights of the next 30 s, or until disarming, are about ``height_m``."""
+    """Return True if the vehicle stays at about ``height_m`` until disarming (at most 30 s), and does not hover."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log

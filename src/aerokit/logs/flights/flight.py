@@ -283,7 +283,7 @@ class FlightLog:
         return self.modes[index - 1].name if index else ""
 
     def item_label(self, item: Waypoint) -> str:
-        """Return the number of a mission item; for ArduPilot, item 0 is "home", and item 1 gets the number 0."""
+        """Return the number to show for a mission item. ArduPilot's item 0 is "home", so its item 1 is shown as 0."""
         if self.autopilot != "ArduPilot":
             return str(item.number)
         return str(item.number - 1) if item.number else "home"
@@ -318,9 +318,10 @@ class FlightLog:
             self.armed[-1] = (begin_s, time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Record home, if it is valid. Later than two seconds after the first arming, a known home is not replaced.
+        """Record home, if it is valid.
 
-        Until arming, ArduPilot moves home with the vehicle.
+        Until arming, ArduPilot moves home with the vehicle. A known home is therefore kept from two seconds after the
+        first arming on.
         """
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
         if not is_valid:  # NaN is not valid, because it fails the comparisons

@@ -128,7 +128,7 @@ def _optional_state(name: str, value: object) -> States:
 
 
 class BinReader(_RowReader):
-    """Reads a ``.bin`` of ArduPilot with pymavlink. The system id is that of its parameters, or else 1."""
+    """Reads a ``.bin`` of ArduPilot with pymavlink. The system id is in its parameters; if it is missing, it is 1."""
 
     _reader: Any = None
 

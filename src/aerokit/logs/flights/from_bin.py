@@ -47,8 +47,9 @@ _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
 # A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-# A row is damaged if it is later than the next row of its table, or earlier than the previous one, by more than
-# _MAX_DISORDER_S, or if it is later than the last but one row of every table by more than _MAX_LATE_S.
+# A row is damaged in two cases:
+# - It is later than the next row of its table, or earlier than the previous one, by more than _MAX_DISORDER_S.
+# - It is later than the last but one row of every table by more than _MAX_LATE_S.
 _MAX_DISORDER_S, _MAX_LATE_S = 1.0, 3600.0
 _SAME_SETPOINT_S = 0.005  # PSCN and PSCE rows with times that differ by at most this are one set-point
 _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the rows
@@ -101,7 +102,7 @@ class _Tables:
     def rows(self, table: str, *columns: str) -> Iterator[tuple[Any, ...]]:
         """Yield a tuple for each row: the seconds since the start of the log, then the values of these columns.
 
-        Yields nothing if a column is missing. Texts are ``str``; numbers have the unit of the table.
+        Yields nothing if a column is missing. Texts are ``str``. Numbers are scaled as the log defines (FMTU, MULT).
         """
         for chunk in self._chunks(table, columns):
             yield from zip(*chunk, strict=True)
@@ -122,8 +123,7 @@ class _Tables:
         row_format = reader.formats[reader.name_to_id[table]]
         indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
         unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
-        # The values of an unpacked row have the order of the file. `positions` has their indices in the order of
-        # TimeUS and `columns`.
+        # An unpacked row has the order of the file. `positions` has the index of each requested column in it.
         positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]
@@ -147,7 +147,7 @@ class _Tables:
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        # Rows have no checksum. One wrong time would move all later rows of a `TimeSeries`.
+        # Rows have no checksum. After a time that is too late, `TimeSeries` would use this time for all later rows.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time
@@ -155,7 +155,7 @@ class _Tables:
         return time <= self._max_s and not (is_outlier and 0.0 <= before <= after + _MAX_DISORDER_S)
 
     def _first_time(self) -> int:
-        # The order is that of the positions in the file. The lowest time could be that of a damaged row.
+        # Use the row that is first in the file. The row with the lowest time could be a damaged one.
         first_rows = list(self._rows_at(0))
         if not first_rows:
             raise FileFormatError(
@@ -165,7 +165,7 @@ class _Tables:
         return time_us
 
     def _rows_at(self, index: int) -> Iterator[tuple[int, int]]:
-        """For each table that has a row ``index``, yield the offset of this row and its time in microseconds."""
+        """Yield the offset and the time in microseconds of row ``index`` of each table that is long enough."""
         reader = self._reader
         for number in reader.name_to_id.values():
             offsets, row_format = reader.offsets[number], reader.formats[number]
@@ -194,7 +194,7 @@ def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
 
 
 def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
-    """Decode the strings of a column, or convert its numbers to the unit of the table."""
+    """Decode the strings of a column, or multiply its numbers by ``scale``."""
     if values and isinstance(values[0], bytes):
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
@@ -345,7 +345,7 @@ class _Reader:
         has_positions = len(target) > 0
         relative = target["altitude_relative_m"]
         for time, height in heights:
-            # Both set-points are logged at the same rate, so each height has a row.
+            # Positions and heights are logged at the same rate, so each height has a row.
             if has_positions:
                 row = max(target.index_at(time), 0)
                 relative[row] = height

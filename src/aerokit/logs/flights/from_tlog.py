@@ -51,7 +51,7 @@ _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
 def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Read a flight's file into it: the data of this system id or, if that is None, of the first autopilot.
+    """Fill a flight from its file, with the data of ``system_id`` or, if that is None, of the first autopilot.
 
     Raises:
         FileFormatError: the log has no heartbeat of an autopilot with this system id.
@@ -99,7 +99,7 @@ class _Reader:
         self._mode_commands = RecordedModeCommands(flight, self._autopilot)
         self._system_status = 0
         self._last_heartbeat_s, self._was_armed = 0.0, False
-        self._armed_gaps: list[tuple[float, float]] = []  # times without HEARTBEAT, after one of an armed vehicle
+        self._armed_gaps: list[tuple[float, float]] = []  # spans without HEARTBEAT, of an armed vehicle
         self._has_battery_status = False
         self._charge_states: dict[int, int] = {}  # MAV_BATTERY_CHARGE_STATE by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
@@ -235,7 +235,7 @@ class _Reader:
 
     def _add_destinations(self) -> None:
         setpoints, destinations = self._flight.position_target, self._destinations
-        # Destinations (POSITION_TARGET_GLOBAL_INT) replace continuous set-points only if the log has none.
+        # Use destinations (POSITION_TARGET_GLOBAL_INT) only if the log has no continuous set-points.
         if setpoints.has("latitude_deg"):
             return
         has_heights = setpoints.has()  # NAV_CONTROLLER_OUTPUT has heights without positions
@@ -324,7 +324,7 @@ class _Reader:
 
     def _note_missing_heartbeats(self) -> None:
         self._end_heartbeat_gap(self._flight.duration_s)
-        # Silences, in which no message arrived, have their own text.
+        # Do not count silences, in which no message arrived: the report describes them separately.
         missing_s = sum(
             end - begin - sum(max(min(end, s.ends_s) - max(begin, s.begins_s), 0.0) for s in self._flight.silences)
             for begin, end in self._armed_gaps

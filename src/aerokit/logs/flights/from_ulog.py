@@ -203,7 +203,7 @@ class _Reader:
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return number and data of each instance of the first of these topics that the log has."""
+        """Return the numbered instances of the first topic in ``names`` that the log has."""
         for name in names:
             instances = [data for data in self._data if data.name == name]
             if instances:
@@ -414,8 +414,8 @@ def _drop_damaged_rows(topics: list[Any]) -> int:
     damaged = 0
     for topic, times in zip(topics, all_times, strict=True):
         before, after = numpy.append(times[:1], times[:-1]), numpy.append(times[1:], times[-1:])
-        # Rows have no checksum. A time is impossible if it is far from those of both neighbours, or later than the
-        # whole log.
+        # Rows have no checksum. A time is impossible if it is far outside the neighbours' times, or far after the end
+        # of the log.
         is_spike = (times > after + _MAX_DISORDER_US) | (times < before - _MAX_DISORDER_US)
         is_damaged = is_spike & (before <= after + _MAX_DISORDER_US) | (times > last_us + _MAX_LATE_US)
         if is_damaged.any():

@@ -30,7 +30,7 @@ class ClockComparison:
         self._previous: tuple[float, int] = (-math.inf, 0)
         self._recorded_s = 0.0
         self._vehicle_s = 0.0
-        # The same of intervals that are long by the vehicle's clock: the computer slept, or the simulation is fast.
+        # The same sums for long intervals of the vehicle's clock: the computer slept, or the simulation is fast.
         self._long_recorded_s = 0.0
         self._long_vehicle_s = 0.0
 
@@ -60,7 +60,7 @@ class ClockComparison:
 
     @property
     def missing_s(self) -> float:
-        """Seconds by which the clock of the recording stood still while the vehicle's advanced."""
+        """Seconds of the vehicle's clock that the recording lacks, probably because its computer slept."""
         return self._long_vehicle_s - self._long_recorded_s if self._is_comparable else 0.0
 
     @property
@@ -80,10 +80,9 @@ class LinkCounter:
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
         """Count received and lost frames, and return the start of the next second.
 
-        Called with the first frame after a gap in the sequence numbers, and with the first frame of a second.
-        ``time_s`` and ``sequence`` are those of this frame. ``expected`` is the sequence number after that of
-        the previous frame; negative if there was none. ``received`` is the number of frames since the last call,
-        including this frame.
+        Called with the first frame after a gap in the sequence numbers, and with the first frame of a second. Its
+        ``sequence`` would be ``expected`` without a gap; ``expected`` is negative for the very first frame.
+        ``received`` counts the frames since the last call, including this frame.
         """
         if expected < 0:
             self._second = int(time_s)  # nothing is known to be lost before the first frame
@@ -101,12 +100,12 @@ class LinkCounter:
         return self._second + 1
 
     def add_silence(self, begins_s: float, ends_s: float, paused_s: float) -> None:
-        """Record a silence of the vehicle. In ``paused_s`` of it, no message of any system was recorded."""
+        """Record a silence of the vehicle. For ``paused_s`` of it, nothing from other systems was recorded either."""
         is_recorded = ends_s - begins_s - paused_s >= MIN_SILENCE_S
         self._silences.append(Silence(begins_s, ends_s, is_recorded))
 
     def end(self, received: int, received_s: float, ends_s: float, paused_s: float) -> None:
-        """Count the last frames. The last of them arrived at ``received_s``."""
+        """Count the last frames, and record the silence between the last one (``received_s``) and the log's end."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
     from aerokit.mavlink.message import Message
 
-# `fields` of a record that was made from a MAVLink message, whose values are in `message` instead.
+# The `fields` of a record with a MAVLink message: its values are in `message`.
 _NO_FIELDS: Mapping[str, Any] = {}
 _PARAMETER_IDS = frozenset((Heartbeat.ID, AutopilotVersion.ID, ParamSet.ID, ParamValue.ID))
 
@@ -93,10 +93,9 @@ class TlogReader(LogReader):
         super().__init__(path)
         self._vehicles: dict[int, _VehicleStates] = {}
         self._framer = Framer()
-        # The autopilot of a system, with its component id, and the capabilities of each component, by system and
-        # component id. They show how an autopilot encodes parameters.
-        self._autopilots: dict[int, tuple[int, Autopilot]] = {}
-        self._capabilities: dict[tuple[int, int], int] = {}
+        # These show how an autopilot encodes parameters.
+        self._autopilots: dict[int, tuple[int, Autopilot]] = {}  # system id → component id and autopilot
+        self._capabilities: dict[tuple[int, int], int] = {}  # (system id, component id) → capabilities
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         framer, decode = self._framer, STANDARD.decode
@@ -179,7 +178,7 @@ class TlogReader(LogReader):
 
 
 class _VehicleStates:
-    """Decodes the states of one vehicle with the same decoders as a live vehicle."""
+    """Decodes the states of one vehicle with `Telemetry`, like a live vehicle."""
 
     def __init__(self, system_id: int, component_id: int) -> None:
         self.component_id = component_id
@@ -200,7 +199,7 @@ class _VehicleStates:
         names = self._states_by_message.get(type(message).__name__, ())
         if names or may_have_texts:
             if message.received_frame is not None:
-                message.received_frame.received_at = now  # becomes the time of the states
+                message.received_frame.received_at = now  # Telemetry takes this as the states' time.
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
             telemetry.expire(now)  # publishes status texts whose last parts are missing
@@ -208,6 +207,6 @@ class _VehicleStates:
             may_have_texts = True
         cells = telemetry.cells
         states = tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)
-        if may_have_texts:  # One message may complete a text and end the wait for the rest of another.
+        if may_have_texts:  # There may be two: a complete one, and an earlier one whose last parts are missing.
             states += tuple(("status_text", text) for text in telemetry.texts_since(now))
         return states

@@ -20,7 +20,7 @@ MissionMessage: TypeAlias = (
 _DEGREES_E7 = 1e7
 _MISSION_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
 _OPENING = (MavFtpOpcode.OPENFILERO, MavFtpOpcode.OPENFILEWO, MavFtpOpcode.CREATEFILE)
-_NO_MISSION_ITEM = (2, 3)  # values of `current` with which an item is a target or an altitude for GUIDED
+_NO_MISSION_ITEM = (2, 3)  # values of `current` for a target or an altitude in GUIDED
 _READING = (MavFtpOpcode.READFILE, MavFtpOpcode.BURSTREADFILE)
 
 
@@ -60,7 +60,7 @@ class RecordedMission:
                 if message.type == MavMissionResult.ACCEPTED:
                     self._items.clear()
         elif isinstance(message, m.MissionCount):  # Items beyond this number belong to an earlier mission.
-            self._is_clearing = False  # The next MISSION_ACK confirms the transfer that begins here.
+            self._is_clearing = False  # The next MISSION_ACK is about this transfer, not about clearing.
             self._items = {number: item for number, item in self._items.items() if number < message.count}
         elif message.current not in _NO_MISSION_ITEM:
             self._add(message)

@@ -74,8 +74,9 @@ def write_report(
     if target_path.suffix.lower() not in (".html", ".htm"):
         raise InvalidArgument(f"target = {str(target_path)!r} is not allowed: the name of a report must end in .html")
     logs = [log] if compare_with is None else [log, compare_with]
+    # Check the logs before the target, because callers may derive its name from the log's.
     for path in logs:
-        check_log_name(Path(path))  # before `exists`, because callers may derive the target from the name of the log
+        check_log_name(Path(path))
     if target_path.exists() and not force:
         raise InvalidArgument(f"{target_path} exists; use force (--force) to replace it")
     flights = [read_flight(path, system_id=system_id, on_progress=on_progress) for path in logs]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MAX_POINTS = 2000
 """Maximum number of points of a line in a timeline."""
 MAX_TRACK_POINTS = 6000
-"""Maximum number of points of a drawn track. Longer lines are simplified further."""
+"""Maximum number of points of a drawn track, even if it then deviates by more than the tolerance."""
 _TRACK_TOLERANCE_M = 0.1
 _ROUNDING_M = 0.01
 _MAX_FENCE_M = 1e6

@@ -93,7 +93,7 @@ def page(
 ) -> str:
     """Return the HTML of the whole page.
 
-    ``summaries`` has a heading, the sentences, and the sentences to emphasise, for each flight. ``colours`` maps themes
+    A summary has a heading, the sentences about a flight, and the sentences to emphasise. ``colours`` maps themes
     ("light", "dark") to colours by name. ``shapes`` are Plotly's shapes for the background of all timelines.
 
     Raises:

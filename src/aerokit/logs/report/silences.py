@@ -29,7 +29,7 @@ def silence_sentences(flight: FlightLog) -> list[str]:
     silences = [
         silence for silence in flight.silences if any(begin <= silence.begins_s <= end for begin, end in flight.armed)
     ]
-    # During a recorded silence, messages of other senders were recorded, so it was the vehicle that was silent.
+    # Messages of other senders were recorded during these silences, so only the vehicle was silent.
     recorded = [silence for silence in silences if silence.is_recorded]
     sentences = [_sentence(flight, silence) for silence in recorded[:_MAX_LISTED]]
     more = len(recorded) - _MAX_LISTED

@@ -24,15 +24,15 @@ def simplify(
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. It
-            is exceeded only by points that are always selected: those of ``keep``, those next to a gap, the first, the
-            last, and every 1024th point.
-        tolerance: maximum distance of an omitted point from the line through the selected points.
+        max_points: maximum number of selected points. Some are always selected, even beyond it: those of ``keep``,
+            those next to a gap, the first, the last, and every 1024th point.
+        tolerance: maximum distance of an omitted point from the line through the selected points. The distance may be
+            larger if ``max_points`` is reached.
         keep: indices that are selected if their coordinates are known.
 
     Returns:
-        The selected indices, including that of one NaN in each gap, and the largest distance of an omitted point from
-        the line through the selected points.
+        The selected indices, with one index for each gap, and the largest distance of an omitted point from the line
+        through the selected points.
     """
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):
@@ -46,9 +46,8 @@ def simplify(
             selected.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
-    # Heap entries: the negative square of the largest deviation from a segment, the index of the point with this
-    # deviation, and the first and last index of the segment. The square is negative, because heapq returns the smallest
-    # item first.
+    # A heap of segments: the negative square of the largest deviation from the segment, the index of the point that has
+    # it, and the first and last index of the segment. Negative, because heapq returns the smallest item first.
     segments = [
         (*_deviation(places, first, last), first, last)
         for first, last in pairwise(sorted(selected))

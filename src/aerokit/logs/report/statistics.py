@@ -37,7 +37,7 @@ _BEFORE_FALL_S = 5.0
 
 
 class FlightStatistics(Snapshot):
-    """Statistics of the time in which the vehicle was armed, or of the whole log if it never was. None: unknown."""
+    """Statistics of the armed time, or of the whole log if the vehicle was never armed. None: unknown."""
 
     armed_s: float | None
     distance_m: float | None
@@ -420,7 +420,7 @@ def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
     for kind in dict.fromkeys(kinds):
         names = failsafe_parameters(flight, kind)
         if not any(name in flight.parameters for name in names):
-            # Names with ACT or ENABL choose the reaction. If no name contains these, all names are returned.
+            # Parameters with ACT or ENABL in their names choose the reaction. If there are none, return all names.
             unknown += [name for name in names if "ACT" in name or "ENABL" in name] or names
     return unknown
 
