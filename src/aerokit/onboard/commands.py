@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
-MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # One takes a picture of a series, another one checks a mission.
+MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # Two more for a series of pictures and the check of an upload.
 
 
 class CommandResult(Snapshot):
@@ -141,8 +141,8 @@ class ComponentCommands:
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
         self.thread_calls: set[asyncio.Future[Any]] = set()
         """Calls of functions in threads that have not returned, also those for which no task waits any more."""
-        # Handlers have their own threads. In the loop's few default threads, slow handlers would delay the saving of
-        # parameters, which uses them, too.
+        # Handlers have their own threads. Parameters are saved in the loop's few default threads, and slow handlers
+        # there would delay this.
         self._threads: ThreadPoolExecutor | None = None  # None before the first call in a thread
         host.knows_command = self.handlers.__contains__
 

@@ -167,7 +167,7 @@ class GimbalAdapter(GimbalMount):
         self._record(flags, is_yaw_locked=target.yaw_locked)
 
     def _record(self, flags: int, *, is_yaw_locked: bool) -> None:
-        # Only after the program's method has returned: if it raises, the gimbal may still turn as before.
+        # If the program's method raises, this is not reached, because the gimbal may still turn as before.
         self._motions.pop("gimbal", None)
         self.flags: int = flags
         self._is_yaw_locked = is_yaw_locked
