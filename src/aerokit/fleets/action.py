@@ -107,7 +107,7 @@ class FleetAction:
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
-        # The order of creation decides which action is newer. `run` may begin later.
+        # The order of creation, not of `run`, decides which action is newer.
         if moves_members:
             for action in context.actions:
                 action._newer_actions.append(self)
@@ -197,7 +197,8 @@ class FleetAction:
                     f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
                 )
             self._last_start_at = self._context.now()
-            for action in self._context.actions:  # In actions that start later, this action's orders are not newer.
+            # An action that starts this member later must not treat this action's order as newer.
+            for action in self._context.actions:
                 action._newer_order_checks.pop(member.name, None)
             if not member.is_available:
                 raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
@@ -258,7 +259,7 @@ class FleetAction:
         )
 
     def _newer_order_check(self, member: Member) -> Callable[[], bool]:
-        """Return a function that returns True if the program has since told the member to land, return or disarm.
+        """Return a function that returns True after a newer order of the program to land, return or disarm.
 
         If this action arms the members, orders to arm count, too.
         """
@@ -464,7 +465,7 @@ class FleetContext:
         self.is_closed = True
         for member in self.members.values():
             member.stop_monitoring()
-        for action in tuple(self.actions):  # They would go on with vehicles that stay connected.
+        for action in tuple(self.actions):  # Otherwise they continue with vehicles that stay connected.
             action.close()
         await self.background.aclose()
 

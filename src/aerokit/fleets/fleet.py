@@ -97,8 +97,8 @@ class Fleet(Selection):
     def release(self, name: str, reason: str = "released by the program") -> None:
         """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
-        If a released member then fails in a running action, the policy orders nothing. The followers of a released
-        leader hold, because the fleet no longer knows who flies it.
+        If a released member then fails in a running action, the policy sends no orders. The followers of a released
+        leader hold, because the fleet no longer knows who flies the leader.
 
         Args:
             name: a member's name or a pattern.

@@ -73,7 +73,7 @@ class Path(Snapshot):
         return self.points[-1].t_s
 
     def legs(self, begin_s: float, end_s: float) -> list[tuple[PathPoint, PathPoint]]:
-        """Return the pairs of consecutive points.
+        """Return the legs of the path, as pairs of points.
 
         The vehicle rests at the first point from ``begin_s`` on, and at the last point until ``end_s``; these rests are
         legs, too.

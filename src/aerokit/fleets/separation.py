@@ -39,7 +39,7 @@ class Route(Snapshot):
 class Conflict(Snapshot):
     """Two paths that come too close to each other.
 
-    ``at_s`` is the time on the first path at which they are closest; None if times are ignored.
+    ``at_s`` is the time of the closest point on the first path; None if times are ignored.
     """
 
     name: str

@@ -86,7 +86,7 @@ class ClockOffset(Snapshot):
 
 
 async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
-    """Measure the offset of a vehicle's clock with TIMESYNC requests; the one with the shortest round trip counts.
+    """Measure the offset of a vehicle's clock by the TIMESYNC request with the shortest round trip.
 
     Raises:
         OperationTimeout: no request was answered.

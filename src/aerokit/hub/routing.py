@@ -130,7 +130,7 @@ class Router(Generic[PortT]):
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
         self._port_count = 0  # number of ports created so far
-        self._unproven: dict[int, None] = {}  # senders that sent no HEARTBEAT yet, and may be noise
+        self._without_heartbeat: dict[int, None] = {}  # These senders may be noise.
         self._swept_at = -math.inf  # time of the last removal of silent senders
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
@@ -155,7 +155,7 @@ class Router(Generic[PortT]):
         if self._nodes.pop(node.number, None) is not None:
             for key in [key for key, sender in self._senders.items() if sender.remove_port(node.number)]:
                 del self._senders[key]
-                self._unproven.pop(key, None)
+                self._without_heartbeat.pop(key, None)
             self.forget_plans()
 
     def forget_plans(self) -> None:
@@ -269,14 +269,14 @@ class Router(Generic[PortT]):
         sender = Sender(source, node.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
-            self._unproven[source] = None
+            self._without_heartbeat[source] = None
             self.forget_plans()
         return sender
 
     def _make_room(self, now: float) -> bool:
-        if self._unproven:
-            source = next(iter(self._unproven))
-            del self._unproven[source], self._senders[source]
+        if self._without_heartbeat:
+            source = next(iter(self._without_heartbeat))
+            del self._without_heartbeat[source], self._senders[source]
         elif now - self._swept_at >= SWEEP_INTERVAL_S:
             self._swept_at = now
             expired = [key for key, sender in self._senders.items() if now - sender.received_at > PEER_TTL_S]
@@ -330,8 +330,8 @@ class Router(Generic[PortT]):
             self.on_change(kind, source, node.port, None if other_node is None else other_node.port)
 
     def _record_heartbeat(self, sender: Sender, node: RouterPort[PortT], body: bytes) -> None:
-        is_first = sender.source in self._unproven
-        self._unproven.pop(sender.source, None)
+        is_first = sender.source in self._without_heartbeat
+        self._without_heartbeat.pop(sender.source, None)
         # A HEARTBEAT at another port may come from a second sender with the same ids. It must not turn a vehicle into a
         # ground station.
         if (is_first or sender.port_number == node.number) and sender.record_heartbeat(body):

@@ -146,9 +146,9 @@ REPEAT_EVENT_S = 60.0
 
 
 class IdentityGuard:
-    """Detects frames of one peer of an endpoint under the ids of an autopilot at another peer.
+    """Rejects frames that one peer of an endpoint sends with the ids of another peer's autopilot.
 
-    `Routes` decides to which peer the autopilot belongs. Ground stations and companions may share ids.
+    `Routes` decides which peer the autopilot has. Ground stations and companions may share ids.
     ``report(kind, peer, text)`` publishes an event.
     """
 

@@ -145,7 +145,7 @@ class Switch:
         if self._ports_to_flush:
             if len(frames) > MAX_BURST_FRAMES:
                 self.flush()
-            elif not (self._is_scheduled or port.reports_bursts):  # Otherwise the link reports the end of the burst.
+            elif not (self._is_scheduled or port.reports_bursts):  # A reported burst is flushed when it ends.
                 self._is_scheduled = True
                 self._loop.call_soon(self.flush)
 

@@ -141,8 +141,8 @@ class ComponentCommands:
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
         self.thread_calls: set[asyncio.Future[Any]] = set()
         """Calls of functions in threads that have not returned, also those for which no task waits any more."""
-        # Handlers have their own threads. Parameters are saved in the loop's few default threads, and slow handlers
-        # there would delay this.
+        # Handlers have their own threads. In the loop's few default threads, slow handlers would delay the saving of
+        # parameters.
         self._threads: ThreadPoolExecutor | None = None  # None before the first call in a thread
         host.knows_command = self.handlers.__contains__
 
@@ -166,7 +166,7 @@ class ComponentCommands:
         self.add_handlers({command: execute})
 
     def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server, which check the parameters themselves.
+        """Register handlers that check the parameters themselves.
 
         Raises InvalidArgument if a command already has a handler.
         """

@@ -454,8 +454,8 @@ class OnboardComponent(ComponentTwin):
             camera: an instance of your subclass of :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
-            InvalidArgument: the component already has a camera or a handler for a camera command; or both a definition
-                file of the camera and parameters of the component exist.
+            InvalidArgument: the component already has a camera, a handler for a camera command, or (if the camera has a
+                definition file) parameters.
             FileFormatError: the definition file is damaged.
         """
         self._loop.call(self.aio.add_camera, camera)

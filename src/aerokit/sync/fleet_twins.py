@@ -165,8 +165,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members in m/s, for corridors; above 0.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
-            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
-                would start too late by more than this, because the event loop was blocked, does not start.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member whose
+                start is delayed by more than this, for example by a blocked event loop, does not start.
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
@@ -542,8 +542,8 @@ class Fleet(FleetTwin, Selection):
     def release(self, name: str, reason: str = "released by the program") -> None:
         """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
-        If a released member then fails in a running action, the policy orders nothing. The followers of a released
-        leader hold, because the fleet no longer knows who flies it.
+        If a released member then fails in a running action, the policy sends no orders. The followers of a released
+        leader hold, because the fleet no longer knows who flies the leader.
 
         Args:
             name: a member's name or a pattern.
