@@ -117,8 +117,8 @@ class Travel(SelectionBase):
                 ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members in m/s, for corridors; above 0.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
-            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member whose
-                start is delayed by more than this, for example by a blocked event loop, does not start.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member does
+                not start if a blocked event loop makes it late by more than this.
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.

@@ -148,7 +148,7 @@ REPEAT_EVENT_S = 60.0
 class IdentityGuard:
     """Rejects frames that one peer of an endpoint sends with the ids of another peer's autopilot.
 
-    `Routes` decides which peer the autopilot has. Ground stations and companions may share ids.
+    `Routes` decides which peer is the autopilot. Ground stations and companions may share ids.
     ``report(kind, peer, text)`` publishes an event.
     """
 
