@@ -57,11 +57,10 @@ class FleetAction:
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
         is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
-        holds_if_cancelled: if the action is cancelled or a function passed by the program raises an error, members that
-            have already finished the action are told to hold as well.
-        moves_members: the action overrules older actions: these send its members no orders of their policy, and do not
-            start members that still wait.
-        arms: the action only arms, so that newer actions that do not end the flight may follow its members' start.
+        holds_if_cancelled: members that have already finished the action are told to hold if the action is cancelled,
+            or if a function of the program raises an error.
+        moves_members: older actions must no longer start the members of this action, or send them orders of a policy.
+        arms: the action only arms. Of the newer actions, only those that end the flight keep its members from starting.
         corridors: the delay of each member, and how late it may start.
     """
 
@@ -94,7 +93,7 @@ class FleetAction:
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
-        self._final_orders: dict[str, object] = {}  # see `FleetContext.newest_orders`; when the member had finished
+        self._final_orders: dict[str, object] = {}  # `FleetContext.newest_orders` when the member finished
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -108,7 +107,7 @@ class FleetAction:
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
-        # The order of creation decides which action is newer. `run` may begin later.
+        # The order of creation, not of `run`, decides which action is newer.
         if moves_members:
             for action in context.actions:
                 action._newer_actions.append(self)
@@ -184,7 +183,7 @@ class FleetAction:
                 return
             has_newer_order = self._newer_order_checks.get(member.name) or self._newer_order_check(member)
             is_overruled = (self._moves_members or self._arms) and (
-                # A landing of the same moment is sent in any case, because the newer action may fail.
+                # A landing without a delay is sent even if there is a newer action, because that action may fail.
                 has_newer_order() or (not self._is_safe and self._has_newer_action(member))
             )
             while wait_s > START_TOLERANCE_S and not is_overruled:
@@ -198,7 +197,8 @@ class FleetAction:
                     f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
                 )
             self._last_start_at = self._context.now()
-            for action in self._context.actions:  # Those that begin later are newer than what this action orders.
+            # An action that starts this member later must not treat this action's order as newer.
+            for action in self._context.actions:
                 action._newer_order_checks.pop(member.name, None)
             if not member.is_available:
                 raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
@@ -233,7 +233,7 @@ class FleetAction:
         member.refresh()
         if not member.is_available:
             raise OperationRejected(f"{self.name}: {name} is {member.status}")
-        # A member that was unavailable during the wait has failed, which must not keep it from landing.
+        # A landing is sent even to a member that was unavailable during the wait.
         if member.absences > absences and not self._is_safe:
             raise OperationRejected(f"{self.name}: {name} was unavailable before it started; nothing was sent to it")
         late_s = connection.now() - began_at - delay_s
@@ -245,7 +245,7 @@ class FleetAction:
 
     def _has_newer_order(self, member: Member) -> bool:
         """Return True if a newer action moves the member, or the program has told it to land or return."""
-        # The landing may also be a part of the action, if it is a function of the program that still runs.
+        # If the action is a function of the program that still runs, the landing may be a part of the action.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
         return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
 
@@ -259,7 +259,7 @@ class FleetAction:
         )
 
     def _newer_order_check(self, member: Member) -> Callable[[], bool]:
-        """Return a function that tells whether the program has told the member to land, return or disarm meanwhile.
+        """Return a function that returns True after a newer order of the program to land, return or disarm.
 
         If this action arms the members, orders to arm count, too.
         """
@@ -272,7 +272,7 @@ class FleetAction:
 
         def has_newer_order() -> bool:
             has_landed = _newest_order(member) is not order_before and _is_ending_flight(member)
-            # A vehicle in the air refuses to disarm, which must not keep it from landing.
+            # A command to disarm does not prevent a landing, because a vehicle in the air refuses to disarm.
             return has_landed or (not self._is_safe and commands_sent() > commands_before)
 
         return has_newer_order
@@ -295,8 +295,8 @@ class FleetAction:
         if self._is_safe or self._context.is_closed or member.state is MemberState.RELEASED:
             return
         self._undecided.append((member, error))
-        # This is a nested call from `_apply_policy` below, which refreshes the other members. The outer call handles
-        # this failure, too.
+        # `_apply_policy` refreshes the other members, which can call this method again. The outer call then handles
+        # the new failure.
         if len(self._undecided) > 1:
             return
         while self._undecided:
@@ -345,11 +345,10 @@ class FleetAction:
                 task = self._context.background.start(
                     partial(self._send_order, member, self._policy_orders[member.name]), f"aerokit policy {member.name}"
                 )
-                if task is not None:  # Not in the task itself: if the fleet closes at once, it never begins.
+                if task is not None:  # The callback runs even if the task is cancelled before it begins.
                     task.add_done_callback(partial(self._on_order_end, member.name))
-        # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
-        # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
-        # The actions of available members whose order is skipped are cancelled, too.
+        # The running actions are cancelled one loop iteration later. By then, the policy's orders have superseded those
+        # of the actions, so that the cancelled actions do not send a hold.
         stopping = [member for member in available if member.name in orders]
         asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
         if not self._policy_orders:
@@ -405,8 +404,7 @@ class FleetAction:
         )
 
     def _hold_finished_members(self) -> None:
-        # Members that have finished the action get an order to hold. Members that still execute it hold because it is
-        # cancelled. Failed and stopped members get no order.
+        # Members that still execute the action hold when it is cancelled. Members that have finished it need an order.
         for member in self._members if self._holds_if_cancelled else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
             if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
@@ -467,7 +465,7 @@ class FleetContext:
         self.is_closed = True
         for member in self.members.values():
             member.stop_monitoring()
-        for action in tuple(self.actions):  # Vehicles that the program passed to the fleet stay connected.
+        for action in tuple(self.actions):  # Otherwise they continue with vehicles that stay connected.
             action.close()
         await self.background.aclose()
 
@@ -517,7 +515,7 @@ FLIGHT_ENDING_ACTIONS = ("hold", "land", "return_to_launch", "disarm", "mission.
 ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
-# Besides those that end the flight, these actions overrule older ones.
+# These actions and `FLIGHT_ENDING_ACTIONS` overrule older actions.
 MOVING_ACTIONS = (
     "take_off",
     "go_to",

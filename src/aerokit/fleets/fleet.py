@@ -32,8 +32,10 @@ class Selection(Actions, Missions, Formations, Shows):
 
     Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
     The action returns a :class:`FleetResult` when all these members have finished or failed. If a member fails, the
-    fleet's policy may send orders to the other members; then the action returns after these orders were executed. If
-    the action is cancelled, all members hold, unless it works on the ground or makes them hold, land or return.
+    fleet's policy may send orders to the other members; then the action returns after these orders were executed.
+
+    If an action is cancelled, all members hold. Exceptions are ``arm``, ``wait_ready``, ``upload``, and actions that
+    end the flight or make members hold.
     """
 
     def __getitem__(self, pattern: str) -> Selection:
@@ -95,8 +97,8 @@ class Fleet(Selection):
     def release(self, name: str, reason: str = "released by the program") -> None:
         """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
-        If a released member then fails in a running action, the policy orders nothing. The followers of a released
-        leader hold, because the fleet no longer knows who flies it.
+        If a released member then fails in a running action, the policy sends no orders. The followers of a released
+        leader hold, because the fleet no longer knows who flies the leader.
 
         Args:
             name: a member's name or a pattern.
@@ -149,7 +151,7 @@ class Fleet(Selection):
             *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …).
                 Events of vehicles arrive as :class:`MemberEvent` with the member's name. Without arguments: all events.
             capacity: maximum number of unread events.
-            overflow: what happens to an event when ``capacity`` is reached. The ``missed`` of the result counts dropped
+            overflow: what happens to an event when ``capacity`` is reached. ``Subscription.missed`` counts dropped
                 events.
 
         Raises:
@@ -184,8 +186,8 @@ class Fleet(Selection):
             *names: names of states (docs/states.md), such as ``"position"`` and ``"batteries"``.
             every_arrival: also report a value that arrives unchanged.
             capacity: maximum number of unread updates.
-            overflow: what happens to an update when ``capacity`` is reached. The ``missed`` of the result counts
-                dropped updates.
+            overflow: what happens to an update when ``capacity`` is reached. ``Subscription.missed`` counts dropped
+                updates.
 
         Raises:
             InvalidArgument: a name is unknown, or none is given.

@@ -241,7 +241,7 @@ class Following:
     async def __aexit__(self, exc_type: object, exc: object, traceback: object) -> None:
         self._stopped.set()
         await self._tasks.aclose()
-        self._context.actions.pop(self._action, None)  # The task may have been cancelled before it began.
+        self._context.actions.pop(self._action, None)  # `run` does this, unless its task was cancelled early.
         if exc is None and not self._has_raised:
             self.raise_if_stopped()
 

@@ -327,7 +327,7 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
 
 
 class _BlockFailed(Exception):
-    """Raised in each vehicle's block if the fleet's block has failed. A vehicle left flying is then logged."""
+    """Raised in each vehicle's block if the fleet's block has failed, so that a vehicle left flying is logged."""
 
 
 class MemberConnections:

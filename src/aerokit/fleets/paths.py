@@ -73,7 +73,7 @@ class Path(Snapshot):
         return self.points[-1].t_s
 
     def legs(self, begin_s: float, end_s: float) -> list[tuple[PathPoint, PathPoint]]:
-        """Return the pairs of consecutive points.
+        """Return the legs of the path, as pairs of points.
 
         The vehicle rests at the first point from ``begin_s`` on, and at the last point until ``end_s``; these rests are
         legs, too.
@@ -119,7 +119,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
         other: the second path.
         slack_s: compare points whose times differ by at most this many seconds. With 0, both vehicles are exactly on
             time; infinite: ignore times.
-        below_m: a distance above this is not computed exactly; the result is then this distance or more.
+        below_m: larger distances are not computed exactly. The result is then ``below_m`` or more.
     """
     begin_s = min(path.begins_at_s, other.begins_at_s)
     end_s = max(path.ends_at_s, other.ends_at_s)
@@ -211,9 +211,9 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
 def _closest_inside(
     start_difference: Sequence[float], vector: Sequence[float], other_vector: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return the s and t (see `_closest`) at which the lines through two legs are closest to each other.
+    """Return how far along two legs, from 0 to 1, the lines through them are closest to each other.
 
-    Returns None if that place is beyond the end of a leg, or if the lines are parallel.
+    Returns None if the lines are closest beyond the end of a leg, or if they are parallel.
     """
     # Dot products of a (`vector`), b (`other_vector`) and d (`start_difference`).
     aa, bb = _dot(vector, vector), _dot(other_vector, other_vector)
@@ -249,9 +249,9 @@ def _closest_on_edge(
     difference: Sequence[float],
     other_difference: Sequence[float],
 ) -> tuple[float, float]:
-    """Return the s and t (see `_closest`) of the closest approach on one edge of the polygon.
+    """Return the point on one edge of the polygon in `_closest` at which two legs are closest.
 
-    The differences are the vectors between the two places at the two ends of the edge.
+    ``difference`` and ``other_difference`` are the vectors between the legs at the two corners.
     """
     step = _difference(other_difference, difference)
     squared_length = _dot(step, step)

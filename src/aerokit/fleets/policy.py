@@ -27,7 +27,7 @@ PolicyOrder = Literal["hold", "land", "return"]
 
 
 class MemberFailure(Snapshot):
-    """``member``, which belongs to ``group``, failed in ``action``.
+    """Failure of a member, passed to a policy function.
 
     ``others`` are the members to which the policy may send orders.
     """
@@ -53,7 +53,7 @@ ORDERS: Mapping[str, PolicyOrder] = {
 
 
 class PolicyRules:
-    """The policies of a fleet and of its groups. The group of the failed member selects the policy."""
+    """Failure policies of a fleet: a default, and others for some groups of members."""
 
     def __init__(self, policy: Policy, by_group: Mapping[str, Policy]) -> None:
         arguments = {"on_error": policy}
@@ -119,7 +119,7 @@ class FleetResult(Mapping[str, Any]):
         self.skipped: dict[str, str] = dict(skipped)
         """Unavailable members, which got no order, with the reason. They are no keys of the FleetResult."""
         self._outcomes = dict(outcomes)
-        self._final_orders: Mapping[str, object] = {}  # those when the member had finished
+        self._final_orders: Mapping[str, object] = {}  # `FleetContext.newest_orders` when each member finished
 
     @property
     def is_complete(self) -> bool:
@@ -127,7 +127,7 @@ class FleetResult(Mapping[str, Any]):
         return not self.failed and not self.stopped
 
     def raise_for_errors(self) -> None:
-        """Raise FleetError if a member failed or was stopped; its ``errors`` has the errors of all these members."""
+        """Raise FleetError if a member failed or was stopped. Its attribute ``errors`` maps these members to errors."""
         errors = {**self.failed, **self.stopped}
         if errors:
             done = len(self._outcomes) - len(errors)

@@ -39,7 +39,7 @@ class Route(Snapshot):
 class Conflict(Snapshot):
     """Two paths that come too close to each other.
 
-    ``at_s`` is the time on the first path at which they are closest; None if times are ignored.
+    ``at_s`` is the time of the closest point on the first path; None if times are ignored.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Deconfliction(Snapshot):
     - ``"refused"``: the conflicts cannot be resolved.
 
     ``conflicts`` are those of the direct paths, without layers and delays. ``heights_m`` are above sea level.
-    ``routes`` has the paths that were compared, and ``stationary`` the positions of members that do not move. Their
+    ``routes`` has the paths that were compared, and ``stationary`` the positions of members that do not move. All
     coordinates are metres north and east of the first route's target, and metres above sea level.
     """
 

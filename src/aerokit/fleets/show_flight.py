@@ -54,7 +54,7 @@ TRACK_GAIN = 0.8
 # therefore catch up even where the track rests.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
-# By how much a member may be late on its track: the comparison of the tracks allows this.
+# Maximum delay of a member that joins its track. The comparison of the tracks allows for this delay.
 CONFLICT_SLACK_S = 0.5
 
 POSITION_MAX_AGE_S = 2.0
@@ -73,7 +73,7 @@ MAX_CLOCK_ERROR_S = 1.0
 class ClockOffset(Snapshot):
     """The offset of a vehicle's clock: its time minus that of the event loop's clock.
 
-    The offset is accurate to half of ``round_trip_s``, the shortest round trip. ``answers`` requests were answered.
+    The offset is accurate to half of ``round_trip_s``, the shortest round trip. ``answers`` is the number of answers.
     """
 
     offset_s: float
@@ -86,7 +86,7 @@ class ClockOffset(Snapshot):
 
 
 async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
-    """Measure the offset of a vehicle's clock with TIMESYNC requests; the one with the shortest round trip counts.
+    """Measure the offset of a vehicle's clock by the TIMESYNC request with the shortest round trip.
 
     Raises:
         OperationTimeout: no request was answered.
@@ -314,8 +314,8 @@ class Shows(Travel):
 
         Args:
             show: the trajectories.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
-                altitude (0 if not given) counts from the first member's home.
+            origin: position of the show's zero point. Its altitude is ``altitude_amsl_m`` or, if that is None,
+                ``altitude_relative_m`` (default 0) above the first member's home.
 
         Raises:
             InvalidArgument: the name of a track is not that of a member.
@@ -344,8 +344,8 @@ class Shows(Travel):
 
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
-                altitude (0 if not given) counts from the first member's home.
+            origin: position of the show's zero point. Its altitude is ``altitude_amsl_m`` or, if that is None,
+                ``altitude_relative_m`` (default 0) above the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start, 0 to 3600.
             lead_s: seconds by which velocities are sent early, to compensate for the vehicles' reaction time (``lag_s``
@@ -465,7 +465,7 @@ async def _fly_track(
     with vehicle._session.streaming("position"):
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
             late_s = vehicle.connection.now() - begin_at - path.begins_at_s
-            # The way from the member's position to its path was not compared with the other paths.
+            # A late member would fly to its track on a way that was not compared with the other tracks.
             if late_s > max_late_s:
                 raise OperationRejected(f"show: {member.name} would join its track {late_s:.1f} s late, so it holds")
             # From here on, the stream itself stops if the event loop is blocked.

@@ -70,12 +70,12 @@ class Travel(SelectionBase):
             separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
-            InvalidArgument: a name is unknown, a target is too far away, or the ``separation`` is by corridors, and
-                ``stagger_s`` is given or ``speed_m_s`` is not the planned speed. Nothing was sent.
+            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` or ``speed_m_s`` does not fit
+                a ``separation`` by corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
-                members, targets or positions, and nothing was sent; or a member became unavailable or got another order
-                between two legs. Then the others stay in their layers.
+                members, targets or positions; nothing was sent. Between two legs: a member became unavailable or got
+                another order; the others stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -117,8 +117,8 @@ class Travel(SelectionBase):
                 ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members in m/s, for corridors; above 0.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
-            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
-                would start too late by more than this, because the event loop was blocked, does not start.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member does
+                not start if a blocked event loop makes it late by more than this.
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
@@ -387,7 +387,8 @@ class Missions(SelectionBase):
 
         result = await self._run("upload", upload, names=tuple(missions))
         result.raise_for_errors()
-        if self._context.newest_upload is missions:  # The missions of two uploads were not compared with each other.
+        # If a newer upload has begun, its missions were not compared with these.
+        if self._context.newest_upload is missions:
             self._context.missions.update(missions)
         return result
 
@@ -457,7 +458,7 @@ class Missions(SelectionBase):
             # A position of any age will do, because it is only the origin of the coordinates.
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
-            # Members on the ground are left out, because missions begin and end beside them.
+            # Members on the ground are ignored, because missions take off and land next to them.
             flying = {
                 name: member
                 for name, member in self._context.members.items()

@@ -63,8 +63,8 @@ class Hub:
 
         Args:
             endpoints: connection strings, unopened links, or `Endpoint` with filters.
-            dialect: known messages. Unknown messages of known senders are forwarded, unchecked, to all endpoints
-                without ``only``.
+            dialect: message definitions. Messages without a definition are forwarded unchecked: from known senders
+                only, and to endpoints without ``only``.
 
         Raises:
             InvalidArgument: an address or a message name is wrong, or two endpoints have the same name.

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-# Answers and parts of transfers. Some have no target, so they look like telemetry, but none may be lost. A rate limit
-# for "*" therefore does not apply to them.
+# Answers and parts of transfers. None may be lost, so rate limits with wildcards do not apply to them.
 ANSWERS = frozenset(
     (
         "COMMAND_ACK", "PARAM_VALUE", "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "MISSION_ACK", "MISSION_COUNT",
@@ -37,10 +36,12 @@ ORDER_MAX_AGE_S = 1.0
 
 
 class Filters:
-    """Selects the messages that an endpoint sends: those that match ``only``, if it is not empty, and not ``block``.
+    """Selects the messages that an endpoint sends, and limits their rates.
+
+    A message must match ``only``, if ``only`` is not empty, and must not match ``block``.
 
     Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the first
-    matching pattern applies. In ``rates``, a pattern with a wildcard does not apply to `ANSWERS`.
+    matching pattern applies. In ``rates``, a pattern with a wildcard does not apply to answers and transfers.
 
     Raises:
         InvalidArgument: a pattern matches no message of the dialect, or a rate is not above 0 and at most 1000.

@@ -47,7 +47,7 @@ class FrameQueue:
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._last_key = 0  # the negative key that was used last
-        # Numbers of queued commands and telemetry frames. While one is 0, the queue is not searched for such frames.
+        # Counts of queued commands and telemetry frames. If a count is 0, the queue need not be searched for this kind.
         self._order_count = 0
         self._telemetry_count = 0
 
@@ -238,10 +238,10 @@ class Port:
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes = queue_above_bytes
-        self._may_queue = queue_above_bytes < UNLIMITED  # False if no number of unsent bytes makes frames wait
+        self._may_queue = queue_above_bytes < UNLIMITED  # False if frames never wait
         self._on_drop = on_drop
         self._queue = FrameQueue()  # frames that wait until the link drains
-        self._due: dict[int, float] = {}  # key of a rate-limited stream → time from which its next frame is forwarded
+        self._due: dict[int, float] = {}  # maps keys of rate-limited streams to the time of their next frame
 
     @property
     def has_queued_frames(self) -> bool:

@@ -102,16 +102,18 @@ class RouterPort(Generic[PortT]):
 class Router(Generic[PortT]):
     """Learns at which ports each sender is received, and plans the destinations of frames.
 
-    - A broadcast goes to all other ports. A broadcast command skips ports through which it would reach a vehicle twice.
-    - A message for one component or system goes to the ports at which its target was received. It is dropped if the
-      target is unknown. A message for an unknown component of a known system goes to the ports of the system.
-    - A vehicle that is received at several ports gets messages through the first port until that port is silent for 3.5
-      s, so that no command arrives twice. A message for a system goes to the one port that is used for its autopilot,
-      and also to each port at which only other components of the system were received. Ground stations that share ids
-      all get the messages for these ids. An autopilot has priority over other senders with its ids.
-    - A frame never goes back to the port at which it arrived, and is forwarded once. Copies that arrive at other ports
-      within two seconds are dropped. Later ones are dropped once several of them show that the ports form a loop.
-      Copies do not change routes.
+    - A broadcast goes to all other ports. A broadcast command skips a port if all autopilots there get it through
+      another port.
+    - A message for a component goes to the ports at which the component was received. If the component is unknown, the
+      message goes to the ports of its system. If the system is unknown, the message is dropped.
+    - A vehicle that is received at several ports gets messages through the first one, so that no command arrives twice.
+      When the vehicle is silent at that port for 3.5 s, another port takes its place.
+    - A message for a whole system goes to the port of its autopilot, and to each port at which only other components of
+      the system were received.
+    - Ground stations that share ids all get the messages for these ids. An autopilot has priority over other senders
+      with its ids.
+    - A frame never goes back to the port at which it arrived. A copy that arrives at another port within two seconds is
+      dropped. Later copies are forwarded until several of them show that the ports form a loop.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
     At most `MAX_ROUTES` senders are remembered. A new sender replaces a sender without heartbeats, or a sender that was
@@ -128,7 +130,7 @@ class Router(Generic[PortT]):
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
         self._port_count = 0  # number of ports created so far
-        self._unproven: dict[int, None] = {}  # senders that sent no HEARTBEAT yet, and may be noise
+        self._without_heartbeat: dict[int, None] = {}  # These senders may be noise.
         self._swept_at = -math.inf  # time of the last removal of silent senders
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
@@ -153,7 +155,7 @@ class Router(Generic[PortT]):
         if self._nodes.pop(node.number, None) is not None:
             for key in [key for key, sender in self._senders.items() if sender.remove_port(node.number)]:
                 del self._senders[key]
-                self._unproven.pop(key, None)
+                self._without_heartbeat.pop(key, None)
             self.forget_plans()
 
     def forget_plans(self) -> None:
@@ -205,7 +207,7 @@ class Router(Generic[PortT]):
         return plans
 
     def route(self, node: RouterPort[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
-        """Return the plan for a frame received at ``node``. ``is_late``: its sequence number is out of order."""
+        """Return the plan for a frame received at ``node``. ``is_late``: the frame is out of order."""
         # Hot path. Sender and target are numbers: system id + 256 · component id.
         body, message_id = frame.body, frame.message_id
         source = body[4] | body[5] << 8
@@ -263,18 +265,18 @@ class Router(Generic[PortT]):
     # ------------------------------------------------------------------------------------ senders
 
     def _add_sender(self, source: int, node: RouterPort[PortT], now: float) -> Sender:
-        """Create a sender. It is remembered if there is room."""
+        """Create a sender, and store it if there is room."""
         sender = Sender(source, node.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
-            self._unproven[source] = None
+            self._without_heartbeat[source] = None
             self.forget_plans()
         return sender
 
     def _make_room(self, now: float) -> bool:
-        if self._unproven:
-            source = next(iter(self._unproven))
-            del self._unproven[source], self._senders[source]
+        if self._without_heartbeat:
+            source = next(iter(self._without_heartbeat))
+            del self._without_heartbeat[source], self._senders[source]
         elif now - self._swept_at >= SWEEP_INTERVAL_S:
             self._swept_at = now
             expired = [key for key, sender in self._senders.items() if now - sender.received_at > PEER_TTL_S]
@@ -328,9 +330,10 @@ class Router(Generic[PortT]):
             self.on_change(kind, source, node.port, None if other_node is None else other_node.port)
 
     def _record_heartbeat(self, sender: Sender, node: RouterPort[PortT], body: bytes) -> None:
-        is_first = sender.source in self._unproven
-        self._unproven.pop(sender.source, None)
-        # At another port, a second sender with the same ids must not turn a vehicle into a ground station.
+        is_first = sender.source in self._without_heartbeat
+        self._without_heartbeat.pop(sender.source, None)
+        # A HEARTBEAT at another port may come from a second sender with the same ids. It must not turn a vehicle into a
+        # ground station.
         if (is_first or sender.port_number == node.number) and sender.record_heartbeat(body):
             self.forget_plans()
         if sender.is_autopilot and node.number not in sender.reported:
@@ -398,7 +401,7 @@ class Router(Generic[PortT]):
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None
         if target is not None:
-            # The sender is reached at this port. The caller removes the port, so that no sender gets its own frame.
+            # A message of a sender to itself would go to the port where it arrived. The caller removes that port.
             return {here: None} if target is origin else dict.fromkeys(target.destinations)
         # A message for an unknown component goes to its whole system.
         members = [sender for sender in self._senders.values() if sender.system_id == system_id]

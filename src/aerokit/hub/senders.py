@@ -146,10 +146,10 @@ REPEAT_EVENT_S = 60.0
 
 
 class IdentityGuard:
-    """Applies the rules of `Routes` to the peers of one endpoint.
+    """Rejects frames that one peer of an endpoint sends with the ids of another peer's autopilot.
 
-    The first peer of an autopilot owns its route; frames of other peers under the same ids are dropped. Ground stations
-    and companions may share ids. ``report(kind, peer, text)`` publishes an event.
+    `Routes` decides which peer is the autopilot. Ground stations and companions may share ids.
+    ``report(kind, peer, text)`` publishes an event.
     """
 
     def __init__(self, link: Link, report: Callable[[HubEventKind, Peer, str], object]) -> None:
@@ -191,7 +191,7 @@ class IdentityGuard:
     def _publish(self, event: Event) -> None:
         if isinstance(event, RouteChanged):
             ids = event.system_id, event.component_id
-            self._reported_at.pop(ids, None)  # The peer that owned the ids may now be the duplicate: report it.
+            self._reported_at.pop(ids, None)  # The former owner may be the next duplicate, which must be reported.
             text = f"messages for {event.system_id}/{event.component_id} are sent here now, no longer to {event.before}"
             self._report("route_changed", self._current_peer, text)
         elif isinstance(event, DuplicateSender):

@@ -24,9 +24,9 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class SharedLink(Link):
-    """Link between a hub and a connection: the hub gets all frames of the connection and sends frames to its vehicles.
+    """Link of a hub over an open connection of this program.
 
-    The connection stays open when this link is closed.
+    The hub gets all frames that the connection receives or sends. The connection stays open when this link is closed.
     """
 
     def __init__(self, connection: Connection) -> None:

@@ -35,7 +35,7 @@ _message_id = attrgetter("message_id")
 
 
 class Switch:
-    """Ports and the router between them, on one event loop.
+    """Forwards frames between ports, on one event loop.
 
     Frames of one read burst are collected per port and written together: at the end of the burst if the link reports
     it, otherwise in the next loop iteration.
@@ -145,7 +145,7 @@ class Switch:
         if self._ports_to_flush:
             if len(frames) > MAX_BURST_FRAMES:
                 self.flush()
-            elif not (self._is_scheduled or port.reports_bursts):  # A reported burst flushes at its end.
+            elif not (self._is_scheduled or port.reports_bursts):  # A reported burst is flushed when it ends.
                 self._is_scheduled = True
                 self._loop.call_soon(self.flush)
 
@@ -159,11 +159,11 @@ class Switch:
             if port.batch:
                 try:
                     port.flush(unix_time)
-                except Exception as error:  # For example, a key has no time stamps left. Other ports must continue.
+                except Exception as error:  # For example, signing has failed. Other ports must continue.
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
-        """Return the frames that this sender is allowed to send, and those of them that arrived out of order."""
+        """Check signatures and ids. Return the accepted frames, and those of them that arrived out of order."""
         admitted: list[Frame] = []
         late: list[Frame] = []
         gateway, guard, peer = port.gateway, port.guard, port.peer

@@ -29,7 +29,7 @@ class Range(Snapshot):
 
 
 class Param(Snapshot):
-    """Number of a command's parameter, 1 to 7, for one argument: ``speed_m_s: Annotated[float, Param(3)]``.
+    """Selects the command parameter, 1 to 7, for a handler's argument: ``speed_m_s: Annotated[float, Param(3)]``.
 
     By default, the arguments of a handler are the command's parameters in order.
     """

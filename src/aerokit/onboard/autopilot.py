@@ -70,9 +70,9 @@ class AutopilotDriver:
 def add_autopilot(
     services: ComponentServices, driver: AutopilotDriver, set_flight_state: Callable[[bool | None, int | None], None]
 ) -> None:
-    """Serve the commands of a vehicle.
+    """Serve the commands that ground stations send to a vehicle.
 
-    ``set_flight_state(is_armed, custom_mode)`` changes the heartbeat. None leaves a value unchanged.
+    ``set_flight_state(is_armed, custom_mode)`` updates the heartbeat. None leaves a value unchanged.
     """
 
     async def call(name: str, *arguments: object) -> None:

@@ -36,7 +36,7 @@ class Photo(Snapshot):
     """A picture that a camera has taken.
 
     ``url`` is the address of the file for other programs: ``mftp:///DCIM/1.jpg`` for a file of `serve_files`, or an
-    HTTP address. The angles are the camera's in degrees, with the yaw from north; None if unknown.
+    HTTP address. The angles are those of the camera; the yaw is from north. None: unknown.
     """
 
     url: str = ""
@@ -316,7 +316,7 @@ class CameraAdapter(CameraDevice):
         move_at: Callable[[float], Any],
     ) -> bool:
         """Move the zoom or the focus. Return False if the camera cannot do that."""
-        # This method also moves the focus, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same numbers.
+        # SET_FOCUS_TYPE has the same numbers as CAMERA_ZOOM_TYPE.
         if kind == CameraZoomType.STEP and math.isfinite(current_percent) and math.isfinite(value):
             kind = CameraZoomType.RANGE
             value = max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
@@ -347,7 +347,7 @@ class CameraAdapter(CameraDevice):
 
 
 def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
-    """Return a function that creates the CAMERA_IMAGE_CAPTURED of a photo from the remaining fields."""
+    """Return a function that creates the CAMERA_IMAGE_CAPTURED message of a photo. The caller adds the other fields."""
     if not isinstance(photo, Photo):
         raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
     position = photo.position

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
-MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # One takes a picture of a series, another one checks a mission.
+MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # Two more for a series of pictures and the check of an upload.
 
 
 class CommandResult(Snapshot):
@@ -142,7 +142,7 @@ class ComponentCommands:
         self.thread_calls: set[asyncio.Future[Any]] = set()
         """Calls of functions in threads that have not returned, also those for which no task waits any more."""
         # Handlers have their own threads. In the loop's few default threads, slow handlers would delay the saving of
-        # parameters, which uses them, too.
+        # parameters.
         self._threads: ThreadPoolExecutor | None = None  # None before the first call in a thread
         host.knows_command = self.handlers.__contains__
 
@@ -166,7 +166,7 @@ class ComponentCommands:
         self.add_handlers({command: execute})
 
     def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server, which check the parameters themselves.
+        """Register handlers that check the parameters themselves.
 
         Raises InvalidArgument if a command already has a handler.
         """

@@ -185,9 +185,9 @@ class OnboardComponent:
         ``Annotated[float, Range(0, 50)]``. A command whose values do not fit is DENIED, and the function is not called.
 
         The function returns None or True for ACCEPTED, False for FAILED, a MAV_RESULT, or a
-        :class:`~aerokit.onboard.CommandResult`. An exception becomes the result and a status text: InvalidArgument,
-        ValueError and PermissionError DENIED, BusyError TEMPORARILY_REJECTED, NotSupported UNSUPPORTED, all others
-        FAILED.
+        :class:`~aerokit.onboard.CommandResult`. An exception is sent as a status text, and becomes the result:
+        DENIED for InvalidArgument, ValueError and PermissionError, TEMPORARILY_REJECTED for BusyError, UNSUPPORTED for
+        NotSupported, and FAILED for all others.
 
         While a coroutine runs, the sender gets IN_PROGRESS, and COMMAND_CANCEL cancels the coroutine (CANCELLED).
         Another command with the same MAV_CMD is TEMPORARILY_REJECTED meanwhile; a repeated transmission is not executed
@@ -348,8 +348,8 @@ class OnboardComponent:
             camera: an instance of your subclass of :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
-            InvalidArgument: the component already has a camera, or a handler for one of its commands; or it has
-                parameters although the camera has a definition file.
+            InvalidArgument: the component already has a camera, a handler for a camera command, or (if the camera has a
+                definition file) parameters.
             FileFormatError: the definition file is damaged.
         """
         from aerokit.onboard.parts import add_camera  # Imported here, because few components need it.
@@ -365,7 +365,7 @@ class OnboardComponent:
             gimbal: an instance of your subclass of :class:`~aerokit.onboard.GimbalDriver`.
 
         Raises:
-            InvalidArgument: the component already has a gimbal, or a handler for one of its commands.
+            InvalidArgument: the component already has a gimbal, or a handler for a gimbal command.
         """
         from aerokit.onboard.parts import add_gimbal  # Imported here, because few components need it.
 

@@ -145,7 +145,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         voltage = current = math.nan
         return m.WinchStatus(time_us, length, speed, tension, voltage, current, _TEMPERATURE_UNKNOWN, report.flags)
 
-    # The line must stop at once, although an action that takes long is a command with the same MAV_CMD.
+    # HOLD stops the line at once, even while another action of DO_WINCH is running.
     services.commands.add(MavCmd.DO_WINCH, do_winch, is_stop=lambda command: command.param2 == WinchActions.HOLD)
     services.add_message(m.WinchStatus, status, STATUS_HZ)
 

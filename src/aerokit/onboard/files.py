@@ -71,8 +71,8 @@ class DirectoryFiles:
     """Serves the regular files below one directory, and files that are kept in memory.
 
     Symbolic links are neither followed nor listed, and ``..`` is refused, so that clients cannot reach anything outside
-    the directory. Devices and pipes cannot be opened. ``memory`` has the component's own files. They hide files in the
-    directory that have the same path, and clients cannot change them.
+    the directory. Devices and pipes cannot be opened. ``memory`` has the component's own files, which clients cannot
+    change. A file in the directory with the same path is hidden.
     """
 
     def __init__(self, root: Path | None, memory: FileTree, *, is_writable: bool) -> None:
@@ -178,7 +178,7 @@ class DirectoryFiles:
         return target
 
     def _path(self, path: str) -> Path:
-        """Return a path below the root. Raise FileFault if it leaves the root or contains a symbolic link."""
+        """Convert a client's path. Raise FileFault if the path leaves the root or contains a symbolic link."""
         if self._root is None:
             raise FileFault(ENOENT)
         target = self._root

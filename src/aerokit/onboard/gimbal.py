@@ -167,7 +167,7 @@ class GimbalAdapter(GimbalMount):
         self._record(flags, is_yaw_locked=target.yaw_locked)
 
     def _record(self, flags: int, *, is_yaw_locked: bool) -> None:
-        # Only after the program's method has returned: if it raises, the gimbal may still turn as before.
+        # The motion is forgotten only here: if the program's method raised an exception, the gimbal may still turn.
         self._motions.pop("gimbal", None)
         self.flags: int = flags
         self._is_yaw_locked = is_yaw_locked

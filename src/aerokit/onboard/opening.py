@@ -136,7 +136,7 @@ async def component(
         finally:
             try:
                 await onboard_component._aclose()
-            finally:  # The component answers until now, so another one with these ids would answer the same messages.
+            finally:  # The ids are reserved until here, because the component answered messages until now.
                 connection.components.discard(key)
 
 

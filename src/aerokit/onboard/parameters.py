@@ -288,7 +288,7 @@ class _Store:
 
 
 def _rounded_limit(limit: float | None, default: ParameterValue) -> float | None:
-    # Values are rounded to 32 bits, so a value at the limit is allowed only if the limit is rounded, too.
+    # Values are rounded to 32 bits. If the limit was not rounded, too, a value at the limit could be refused.
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 

@@ -454,8 +454,8 @@ class OnboardComponent(ComponentTwin):
             camera: an instance of your subclass of :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
-            InvalidArgument: the component already has a camera, or a handler for one of its commands; or it has
-                parameters although the camera has a definition file.
+            InvalidArgument: the component already has a camera, a handler for a camera command, or (if the camera has a
+                definition file) parameters.
             FileFormatError: the definition file is damaged.
         """
         self._loop.call(self.aio.add_camera, camera)
@@ -469,7 +469,7 @@ class OnboardComponent(ComponentTwin):
             gimbal: an instance of your subclass of :class:`~aerokit.onboard.GimbalDriver`.
 
         Raises:
-            InvalidArgument: the component already has a gimbal, or a handler for one of its commands.
+            InvalidArgument: the component already has a gimbal, or a handler for a gimbal command.
         """
         self._loop.call(self.aio.add_gimbal, gimbal)
 

@@ -90,8 +90,10 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
     Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
     The action returns a :class:`FleetResult` when all these members have finished or failed. If a member fails, the
-    fleet's policy may send orders to the other members; then the action returns after these orders were executed. If
-    the action is cancelled, all members hold, unless it works on the ground or makes them hold, land or return.
+    fleet's policy may send orders to the other members; then the action returns after these orders were executed.
+
+    If an action is cancelled, all members hold. Exceptions are ``arm``, ``wait_ready``, ``upload``, and actions that
+    end the flight or make members hold.
     """
 
     @property
@@ -125,12 +127,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
             separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
-            InvalidArgument: a name is unknown, a target is too far away, or the ``separation`` is by corridors, and
-                ``stagger_s`` is given or ``speed_m_s`` is not the planned speed. Nothing was sent.
+            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` or ``speed_m_s`` does not fit
+                a ``separation`` by corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
-                members, targets or positions, and nothing was sent; or a member became unavailable or got another order
-                between two legs. Then the others stay in their layers.
+                members, targets or positions; nothing was sent. Between two legs: a member became unavailable or got
+                another order; the others stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -163,8 +165,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 ``"refuse"`` refuses crossing paths.
             speed_m_s: ground speed of all members in m/s, for corridors; above 0.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
-            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
-                would start too late by more than this, because the event loop was blocked, does not start.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member does
+                not start if a blocked event loop makes it late by more than this.
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
@@ -185,8 +187,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             show: the trajectories.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
-                altitude (0 if not given) counts from the first member's home.
+            origin: position of the show's zero point. Its altitude is ``altitude_amsl_m`` or, if that is None,
+                ``altitude_relative_m`` (default 0) above the first member's home.
 
         Raises:
             InvalidArgument: the name of a track is not that of a member.
@@ -214,8 +216,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
-                altitude (0 if not given) counts from the first member's home.
+            origin: position of the show's zero point. Its altitude is ``altitude_amsl_m`` or, if that is None,
+                ``altitude_relative_m`` (default 0) above the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start, 0 to 3600.
             lead_s: seconds by which velocities are sent early, to compensate for the vehicles' reaction time (``lag_s``
@@ -540,8 +542,8 @@ class Fleet(FleetTwin, Selection):
     def release(self, name: str, reason: str = "released by the program") -> None:
         """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
-        If a released member then fails in a running action, the policy orders nothing. The followers of a released
-        leader hold, because the fleet no longer knows who flies it.
+        If a released member then fails in a running action, the policy sends no orders. The followers of a released
+        leader hold, because the fleet no longer knows who flies the leader.
 
         Args:
             name: a member's name or a pattern.
@@ -580,7 +582,7 @@ class Fleet(FleetTwin, Selection):
             *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …).
                 Events of vehicles arrive as :class:`MemberEvent` with the member's name. Without arguments: all events.
             capacity: maximum number of unread events.
-            overflow: what happens to an event when ``capacity`` is reached. The ``missed`` of the result counts dropped
+            overflow: what happens to an event when ``capacity`` is reached. ``Subscription.missed`` counts dropped
                 events.
 
         Raises:
@@ -601,8 +603,8 @@ class Fleet(FleetTwin, Selection):
             *names: names of states (docs/states.md), such as ``"position"`` and ``"batteries"``.
             every_arrival: also report a value that arrives unchanged.
             capacity: maximum number of unread updates.
-            overflow: what happens to an update when ``capacity`` is reached. The ``missed`` of the result counts
-                dropped updates.
+            overflow: what happens to an update when ``capacity`` is reached. ``Subscription.missed`` counts dropped
+                updates.
 
         Raises:
             InvalidArgument: a name is unknown, or none is given.
