@@ -198,8 +198,20 @@ def test_mission_clear_refused() -> None:
     exchange = MissionClear(1, 1)
     exchange.start(0.0)
     exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.1)
+    assert exchange.take_outbox() == [m.MissionClearAll(1, 1)] * 2
+    exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.2)
     with pytest.raises(MissionRejected):
         exchange.result()
+
+
+def test_mission_clear_errors_for_late_items_are_no_refusal() -> None:
+    exchange = MissionClear(1, 1, round_trip=RoundTrip(0.5))
+    exchange.start(0.0)
+    for number in range(2):
+        exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.1 + number / 10)
+    exchange.receive(m.MissionAck(*GCS, Result.ACCEPTED), 0.5)
+    assert exchange.done
+    exchange.result()
 
 
 def test_mission_clear_unanswered() -> None:

@@ -150,6 +150,17 @@ def test_parameter_list_waits_for_paused_stream() -> None:
     assert repeated_requests(channel) == []
 
 
+def test_parameter_list_is_not_delayed_by_answers_to_others() -> None:
+    """The request for the list is lost. PX4's answers to reads by name have an index, and look like parts of it."""
+    vehicle = FakeVehicle(table_of(100))
+    channel = Channel(vehicle)
+    channel.is_lost = lambda message: isinstance(message, m.ParamRequestList)
+    for number, index in enumerate([40, 50, *[60] * 28]):
+        channel.at(2.0 * number, partial(vehicle.say, vehicle.value(f"PARAM_{index:04}", index)))
+    assert len(channel.run(listing())) == 100
+    assert channel.now < 25.0
+
+
 def test_parameter_list_repeats_lost_request() -> None:
     channel = Channel(FakeVehicle(table_of(100)))
     lost = [True, True]

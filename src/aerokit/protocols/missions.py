@@ -144,6 +144,7 @@ class MissionClear(MissionExchange[None]):
     """
 
     expects: tuple[type[Message], ...] = (MissionAck,)
+    _has_error = False  # True once ERROR was received and the request was repeated
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -151,6 +152,8 @@ class MissionClear(MissionExchange[None]):
 
     def receive(self, message: Message, now: float) -> None:
         """Process the MISSION_ACK. OPERATION_CANCELLED and INVALID_SEQUENCE are ignored: they answer an earlier upload.
+
+        ERROR may answer a late item of an earlier upload, so the request is repeated once.
 
         A late ACCEPTED of an earlier upload looks like the answer to this request and is accepted. The caller therefore
         reads the number of items afterwards.
@@ -161,6 +164,11 @@ class MissionClear(MissionExchange[None]):
             if self._attempt == 1:  # After a repetition, it is unknown which transmission was answered.
                 self.round_trip.add_sample(now - self._sent_at)
             self._finish(None)
+        elif message.type == MavMissionResult.ERROR and not self._has_error:
+            self._has_error = True
+            self._repeat(now)
+        elif message.type == MavMissionResult.ERROR and now - self._sent_at < (self.round_trip.fastest_s or 0.0) / 2:
+            return  # It is too early to answer the repetition.
         elif message.type not in (MavMissionResult.OPERATION_CANCELLED, MavMissionResult.INVALID_SEQUENCE):
             self._reject(message.type)
 
@@ -168,6 +176,9 @@ class MissionClear(MissionExchange[None]):
         if self._is_idle(now):
             self._fail(self._timed_out(now))
             return
+        self._repeat(now)
+
+    def _repeat(self, now: float) -> None:
         self._attempt += 1
         self._send(now)
 

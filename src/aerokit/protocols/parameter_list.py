@@ -113,6 +113,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._on_value_without_index(message, now)
             return
         is_streamed = self._is_streaming and index >= self._next_index
+        is_requested = index in self._window  # Otherwise it answers a request of others, which delays nothing.
         self._record_count(message.param_count, is_streamed=is_streamed)
         if is_streamed:
             self._on_streamed_value(index, now)
@@ -120,7 +121,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._window.on_answer(index, now)
         # An answer to a request delays the stream, so it restarts the time-out, too. Near the end of the list it does
         # not, so that the last missing values are requested early.
-        if self._is_streaming and (is_streamed or not self._is_near_end):
+        if self._is_streaming and (is_streamed or (is_requested and not self._is_near_end)):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
         if parameter.name not in self._parameters and len(self._parameters) >= MAX_PARAMETERS:

@@ -179,6 +179,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             super()._on_error(message, now)
 
 
+# Seconds after the first PARAM_SET in which old values may still arrive, as late answers to earlier requests.
+LATE_ANSWERS_S = 1.0
 # Maximum number of writes in flight. ArduPilot saves through a queue of 30, which must not overflow while armed.
 WRITE_WINDOW = 10
 
@@ -191,7 +193,7 @@ class ParameterWrites(ParameterRequests):
     - The requested value with the requested type. The write is complete.
     - No answer. The value is read.
     - The value from before, or any value if that is unknown. The write may have been lost, so PARAM_SET is sent again.
-      If the same value is reported eight times in a row, it is the result.
+      If the same value is reported eight times in a row, and still after a second, it is the result.
     - Another value. The vehicle has rounded or clamped the request, or another station has set the value. PARAM_SET is
       not sent again, because it would undo the other station's change. A value reported twice in a row is the result.
 
@@ -223,6 +225,7 @@ class ParameterWrites(ParameterRequests):
         )
         self._before = dict(before)
         self._recently_written = set(recent)
+        self._may_be_late = frozenset(self._recently_written)  # names whose earlier values may arrive late
         self._to_set = set(self._requested)  # names whose next request is a PARAM_SET
         self._repeated_answers: dict[str, RepeatedAnswers[Parameter]] = {}
         self._stale_answers = StaleAnswerFilter(self.round_trip)
@@ -268,12 +271,16 @@ class ParameterWrites(ParameterRequests):
         if self._stale_answers.is_stale(name, sent_at, now, attempts=self._window.attempts(name)):
             return
         answers.add(reported)
-        self._window.on_answer(name, now)
         before = self._before.get(name)  # None if unknown
         may_be_unchanged = before is None or same_value(reported.value, before)
         if may_be_unchanged and not is_as_requested:
             self._to_set.add(name)  # The value may still be the old one, so PARAM_SET is sent again.
-        if answers.are_conclusive(is_unchanged=may_be_unchanged):
+        is_conclusive = answers.are_conclusive(is_unchanged=may_be_unchanged)
+        may_be_late = may_be_unchanged or name in self._may_be_late
+        if is_conclusive and may_be_late and now < self._started_at + LATE_ANSWERS_S:
+            return  # The request is repeated when it is overdue.
+        self._window.on_answer(name, now)
+        if is_conclusive:
             self._settle(name, reported, now)
         else:
             self._window.request(name)

@@ -401,6 +401,21 @@ async def test_unacknowledged_operation_is_stopped() -> None:
 # ------------------------------------------------------------------------------------ silent cameras
 
 
+async def test_stop_of_cancelled_series_is_repeated_after_silence() -> None:
+    camera = SimulatedCamera()
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=(camera,))) as flight:
+        await flight.vehicle.camera.wait_found()
+        with anyio.move_on_after(5.0):
+            async with flight.vehicle.camera.photo_interval(1.0):
+                flight.copter.faults.silent = camera.faults.silent = True
+                await anyio.sleep_forever()
+        await anyio.sleep(8)
+        assert camera.captures.is_busy
+        flight.copter.faults.silent = camera.faults.silent = False
+        await anyio.sleep(5)
+        assert not camera.captures.is_busy
+
+
 async def test_order_is_not_resent_to_silent_camera() -> None:
     """The autopilot's HEARTBEAT does not count for a camera with a component id of its own."""
     camera = SimulatedCamera()

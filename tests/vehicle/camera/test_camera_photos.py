@@ -350,6 +350,14 @@ async def test_load_captures_requests_earlier_pictures() -> None:
         assert [capture.index for capture in await vehicle.camera.load_captures()] == [0, 1, 2]
 
 
+async def test_load_captures_survives_a_lost_status() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.take_photo()
+        camera.faults.lose(m.CameraCaptureStatus, times=2)
+        assert [capture.index for capture in await vehicle.camera.load_captures()] == [0]
+
+
 async def test_load_captures_returns_those_that_camera_still_has() -> None:
     camera = SimulatedCamera()
     camera.max_images = 4

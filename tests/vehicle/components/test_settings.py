@@ -175,6 +175,33 @@ async def test_set_returns_the_value_taken() -> None:
         assert (await shelf.settings.set("CAM_EV", 2.5)).value == 1.0
 
 
+@pytest.mark.parametrize("with_definition", [True, False])
+async def test_lost_write_after_cancelled_one_is_repeated(
+    monkeypatch: pytest.MonkeyPatch, with_definition: bool
+) -> None:
+    """The value of the cancelled write is not taken for the camera's answer to the second write."""
+    async with on_board() as bench:
+        if with_definition:
+            await bench.settings.fetch_definition()
+        await bench.settings.download()
+        bench.camera.faults.lose(m.ParamExtAck, times=1000)
+        bench.camera.faults.lose(m.ParamExtValue, times=1000)
+        with anyio.move_on_after(1.0):
+            await bench.settings.set("CAM_QUALITY", 50)
+        bench.camera.faults.lost_messages.clear()
+        send = bench.vehicle.connection._try_to_send
+
+        def lose_first_write(message: Message) -> bool:
+            if not isinstance(message, m.ParamExtSet):
+                return send(message)
+            monkeypatch.undo()
+            return True
+
+        monkeypatch.setattr(bench.vehicle.connection, "_try_to_send", lose_first_write)
+        assert (await bench.settings.set("CAM_QUALITY", 70)).value == 70
+        assert bench.values["CAM_QUALITY"] == 70
+
+
 async def test_silent_camera_times_out() -> None:
     async with on_board() as shelf:
         await shelf.settings.download()

@@ -111,6 +111,15 @@ async def test_pay_out_waits_although_first_status_was_lost(lost: str) -> None:
         assert flight.copter.devices.line_m == pytest.approx(2.0, abs=0.15)
 
 
+async def test_pay_out_waits_although_link_was_interrupted() -> None:
+    async with on_ground() as flight, anyio.create_task_group() as tasks:
+        flight.copter.faults.silent = True
+        tasks.start_soon(flight.vehicle.winch().pay_out, 2.0)
+        await anyio.sleep(6)
+        flight.copter.faults.silent = False
+    assert flight.copter.devices.line_m == pytest.approx(2.0, abs=0.15)
+
+
 @pytest.mark.parametrize("name", ["pay_out", "look_at"])
 async def test_call_ends_with_vehicle_although_connection_stays(name: str) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)

@@ -339,6 +339,14 @@ async def test_mission_file_is_compared_exactly(monkeypatch: pytest.MonkeyPatch)
         assert difference == f"item 0 (NAV_WAYPOINT): x is {mission[0].x + 3} instead of {mission[0].x}"
 
 
+async def test_ftp_method_with_unknown_capabilities_is_tried() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.lose(m.AutopilotVersion, times=1000)
+    async with open_flight(copter) as flight:
+        await flight.vehicle.mission.upload(long_mission(3), method="ftp")
+        assert holds(flight, long_mission(3))
+
+
 async def test_ftp_method_without_mavftp_is_not_supported() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.no_ftp = True

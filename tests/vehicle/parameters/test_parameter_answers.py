@@ -122,7 +122,7 @@ async def test_echo_of_previous_write_confirms_nothing(grounded: Flight) -> None
 async def test_late_value_during_other_writes_does_not_stay(grounded: Flight) -> None:
     """The late answer to a read arrives after the confirmation, but before those of the other parameters."""
     copter, parameters = grounded.copter, grounded.vehicle.parameters
-    await parameters.get("LAND_SPEED")
+    await parameters.download()
     on_set = copter.handlers[ParamSet.ID]
 
     def send_late_value(message: ParamSet, channel: Any) -> None:
@@ -131,6 +131,8 @@ async def test_late_value_during_other_writes_does_not_stay(grounded: Flight) ->
         on_set(message, channel)
 
     copter.handlers[ParamSet.ID] = send_late_value
+    await parameters.set_many({"LAND_SPEED": 61, "RTL_ALT": 2000})
+    assert (await parameters.upload({"LAND_SPEED": 50}))["LAND_SPEED"].outcome == "set"
     await parameters.set_many({"LAND_SPEED": 61, "RTL_ALT": 2000})
     await anyio.sleep(1.5)
     assert parameters.table["LAND_SPEED"].value == copter.parameters["LAND_SPEED"] == 61

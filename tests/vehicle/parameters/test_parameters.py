@@ -313,6 +313,17 @@ async def test_late_message_with_replaced_value_is_ignored() -> None:
         assert parameters.table["RTL_ALT"].value == 1500
 
 
+async def test_late_message_from_before_two_writes_does_not_stay() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        await parameters.set("RTL_ALT", 2000)
+        await parameters.set("RTL_ALT", 2500)
+        flight.wire.deliver(FrameEncoder(1, 1).encode(messages.ParamValue("RTL_ALT", 1500.0, 6, 120, 0xFFFF)))
+        await anyio.sleep(1.5)
+        assert parameters.table["RTL_ALT"].value == 2500
+
+
 async def test_write_undone_by_another_station_at_once_is_noticed() -> None:
     """The value looks like a late message from before the write, so it is read when no late message may arrive."""
     simulated = copter()
@@ -490,6 +501,20 @@ async def test_set_many_returns_one_result_each() -> None:
         assert await flight.vehicle.parameters.set_many({}) == {}
 
 
+async def test_reboot_while_names_are_read_makes_none_unknown() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.get("LAND_SPEED")
+
+        def reboot(message: messages.ParamValue) -> None:
+            detach()
+            parameters._access.forget()
+
+        detach = flight.vehicle.connection.bus.attach(messages.ParamValue, reboot)
+        results = await parameters.set_many({"LAND_SPEED": 60, "RTL_ALT": 2000})
+        assert {name: result.outcome for name, result in results.items()} == {"LAND_SPEED": "set", "RTL_ALT": "set"}
+
+
 async def test_unconfirmed_write_times_out() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
@@ -562,6 +587,39 @@ async def test_upload_sends_only_differences(method: Any, tmp_path: Path) -> Non
         )
         assert {name for name, _, _ in received.events} == set(changed)
         assert set(sent_writes(flight)) == (set(changed) if method == "set" else set())
+
+
+async def test_upload_after_cancelled_write_sends_known_value() -> None:
+    """The vehicle has set the value of the cancelled write, but its answer was lost."""
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        before = (await parameters.download())["RTL_ALT"].value
+        flight.copter.faults.lose(messages.ParamValue, times=1000)
+        with anyio.move_on_after(1.0):
+            await parameters.set("RTL_ALT", 2000)
+        flight.copter.faults.lost_messages.clear()
+        results = await parameters.upload({"RTL_ALT": before})
+        assert (results["RTL_ALT"].outcome, results["RTL_ALT"].before) == ("set", 2000)
+        assert flight.copter.parameters["RTL_ALT"] == before
+
+
+async def test_lost_write_after_cancelled_one_is_repeated() -> None:
+    """The value of the cancelled write is neither the value from before, nor another station's."""
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        flight.copter.faults.lose(messages.ParamValue, times=1000)
+        with anyio.move_on_after(1.0):
+            await parameters.set("RTL_ALT", 2000)
+        flight.copter.faults.lost_messages.clear()
+        on_set = flight.copter.handlers[messages.ParamSet.ID]
+
+        def lose_first(_message: messages.ParamSet, _channel: Any) -> None:
+            flight.copter.handlers[messages.ParamSet.ID] = on_set
+
+        flight.copter.handlers[messages.ParamSet.ID] = lose_first
+        assert (await parameters.set("RTL_ALT", 2500)).outcome == "set"
+        assert flight.copter.parameters["RTL_ALT"] == 2500
 
 
 async def test_upload_by_file_without_changes_sends_no_file() -> None:
@@ -789,6 +847,22 @@ async def test_cached_list_takes_one_request(tmp_path: Path) -> None:
         assert await vehicle.parameters.download(cache=tmp_path) == first
         assert vehicle.parameters.is_complete
         assert now() - begun < 0.05
+
+
+async def test_reboot_before_list_is_cached_repeats_the_download(tmp_path: Path) -> None:
+    async with open_px4(px4()) as flight:
+        parameters, answers = flight.vehicle.parameters, 0
+
+        def reboot_at_last_hash(message: messages.ParamValue) -> None:
+            nonlocal answers
+            answers += message.param_id == "_HASH_CHECK"
+            if answers == 3:  # The first precedes the list, the second begins it.
+                parameters._access.forget()
+
+        flight.vehicle.connection.bus.attach(messages.ParamValue, reboot_at_last_hash)
+        assert len(await parameters.download(cache=tmp_path, method="list")) == 120
+        parameters._access.forget()
+        assert len(await parameters.download(cache=tmp_path)) == 120
 
 
 async def test_changed_hash_invalidates_the_cache(tmp_path: Path) -> None:

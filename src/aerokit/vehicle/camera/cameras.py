@@ -138,7 +138,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         count: int | None = None
         with anyio.move_on_after(timeout):
             await self._link.identify()
-            status = await self._shutter.request_status()
+            status = await self._shutter.request_status_reliably()
             if status is None:
                 raise self._link.timeout_error("did not report how many pictures it has taken")
             count = status.image_count

@@ -191,7 +191,13 @@ class CameraOrders:
         async def confirm() -> None:
             try:
                 if order.is_newest:
-                    await self.command(command, *params, order=order, was_just_sent=True)
+                    try:
+                        await self.command(command, *params, order=order, was_just_sent=True)
+                    except CommandTimeout:
+                        if is_awaited:
+                            raise
+                        await self._session.wait_for_heartbeat()  # The command may have been lost in a silence.
+                        await self.command(command, *params, order=order)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:

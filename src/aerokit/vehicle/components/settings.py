@@ -64,6 +64,7 @@ class Settings:
         self._files_of = files_of
         self._known: dict[str, Setting] = {}
         self._missing: set[str] = set()  # names of settings that the component does not have
+        self._in_doubt: set[str] = set()  # settings whose last write was cancelled or not confirmed
         self._is_complete = False
         self._reboots = 0  # number of reboots of the vehicle so far
         self._definition: CameraDefinition | None = None
@@ -256,7 +257,7 @@ class Settings:
 
     async def _write_undefined(self, name: str, value: object, idle_timeout_s: float) -> Setting:
         known = self._known.get(name)
-        if known is None:
+        if known is None or name in self._in_doubt:
             known = _setting_or_raise((await self._read([name], idle_timeout_s))[name])
         raw_value = checked_setting(name, value, known.type)
         return await self._write(name, raw_value, known.type, known.value, idle_timeout_s)
@@ -271,7 +272,7 @@ class Settings:
         to_read = [
             setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])
         ]
-        if name not in self._known and not setting_definition.write_only:
+        if (name not in self._known or name in self._in_doubt) and not setting_definition.write_only:
             to_read.append(name)
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
         for answered_name, answer in answers.items():
@@ -301,7 +302,10 @@ class Settings:
             round_trip=transfers.round_trip,
             idle_timeout_s=idle_timeout_s,
         )
-        return await transfers.run(exchange)
+        self._in_doubt.add(name)
+        confirmed = await transfers.run(exchange)
+        self._in_doubt.discard(name)
+        return confirmed
 
     async def _read(self, names: Iterable[str], idle_timeout_s: float) -> dict[str, SettingAnswer]:
         transfers = self._transfers

@@ -90,6 +90,9 @@ class Winch(ReadOnly):
         order = self._context.arbiter.device_order(self._topic)
         status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
         await self._context.sender.await_recent_state(order)  # The vehicle may have become silent during the wait.
+        if status_before is None:  # The requests may have been lost in a silence.
+            status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
+            await self._context.sender.await_recent_state(order)
 
         def has_paid_out(status: m.WinchStatus) -> bool:
             assert status_before is not None

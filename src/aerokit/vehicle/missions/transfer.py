@@ -92,8 +92,8 @@ class PlanChannel:
     async def clear(self) -> None:
         await self._run(MissionClear(*self._target, **self._wire_options))
 
-    async def has_ftp(self) -> bool:
-        return await self._has_capability(MavProtocolCapability.FTP, by_default=False)
+    async def has_ftp(self, *, by_default: bool) -> bool:
+        return await self._has_capability(MavProtocolCapability.FTP, by_default=by_default)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
         """Write the plan's file. ArduPilot evaluates the file when it is closed, and does not report the result."""
@@ -296,7 +296,7 @@ class PlanTransfer(Generic[PlanT]):
         """
         if method == "items":
             return False
-        has_ftp = await self._channel.has_ftp()
+        has_ftp = await self._channel.has_ftp(by_default=method == "ftp")
         if method == "ftp":
             if not has_ftp:
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")

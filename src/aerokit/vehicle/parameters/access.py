@@ -66,6 +66,7 @@ class ParameterAccess:
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
         # Last value of each parameter that this program has written and the vehicle has confirmed.
         self.written: dict[str, int | float] = {}
+        self._attempted: set[str] = set()  # names that this program has ever tried to write
 
     @property
     def _read_round_trip(self) -> RoundTrip:
@@ -104,12 +105,12 @@ class ParameterAccess:
                 is_loaded = await cached_list.load_if_current(refresh)
                 if is_loaded:
                     return self.store.table
-            await self._download(method, idle_timeout_s, on_progress)
-            while not self.store.is_complete:  # The vehicle has rebooted meanwhile.
+            while True:
                 await self._download(method, idle_timeout_s, on_progress)
-            if cached_list is not None:
-                await cached_list.save()
-            return self.store.table
+                if cached_list is not None:
+                    await cached_list.save()
+                if self.store.is_complete:  # Otherwise the vehicle has rebooted meanwhile.
+                    return self.store.table
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         if method == "ftp" or (method == "auto" and await self.has_pack()):
@@ -305,7 +306,7 @@ class ParameterAccess:
 
         transfers = self._transfers
         names = _names(parameters)
-        known = [self.store.get(name) for name in names]
+        known = [self.store.get(name) for name in names if not self.is_in_doubt(name)]
         old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
         self._forget_written(names)
         # Recently written parameters are read back, so their answers take as long as those of reads.
@@ -343,9 +344,18 @@ class ParameterAccess:
                 self._read_later(name, transfers.connection.now() + IN_FLIGHT_S)
         return answers
 
+    def is_in_doubt(self, name: str) -> bool:
+        """Return True if the known value may be outdated.
+
+        The last write was cancelled or not confirmed, or a message with another value has arrived after it.
+        """
+        known, written = self.store.get(name), self.written.get(name)
+        return name in self._attempted and not (known and written is not None and same_value(known.value, written))
+
     def _forget_written(self, names: Iterable[str]) -> None:
         # The vehicle may have other values from now on.
         for name in names:
+            self._attempted.add(name)
             self.written.pop(name, None)
             self.store.unmark_replaced(name)
 
@@ -438,7 +448,9 @@ class _CachedList:
     async def save(self) -> None:
         # Another hash means that a parameter changed during the download.
         if self._hash is not None and self._hash == await self._read_hash():
-            self._cache.save(await self._key(), self._hash, self._access.store.table)
+            key = await self._key()
+            if self._access.store.is_complete:  # Otherwise the vehicle has rebooted meanwhile.
+                self._cache.save(key, self._hash, self._access.store.table)
 
     async def _key(self) -> str:
         from aerokit.vehicle.parameters.store import vehicle_key

@@ -33,7 +33,7 @@ class ParameterStore:
 
     def __init__(self, transfers: Transfers, on_discarded: Callable[[str, float], None]) -> None:
         self._transfers = transfers
-        # Called for each ignored message with the parameter's name and the time until which its old value is ignored.
+        # Called after a message that may be late, with the parameter's name and the time after which its values count.
         self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table; None until it is built again after a change.
@@ -134,10 +134,11 @@ class ParameterStore:
         if old is None and len(self._known) >= MAX_PARAMETERS:
             return  # A faulty vehicle may send new names without end.
         replaced_value = self.replaced_value(name)
-        if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
-            # This message is from before the last write, or another station has undone the write.
+        if old is not None and replaced_value is not None and not same_value(received.value, old.value):
+            # This message is from before the last write, or another station has written the parameter.
             self._on_discarded(name, self._replaced[name][1])
-            return
+            if same_value(received.value, replaced_value):
+                return
         new = received if old is None else merge_update(old, received, self.bytewise)
         self._known[name] = new
         self._table = None

@@ -76,7 +76,11 @@ class NameResolver:
         """Resolve names, reading parameters that are unknown. Warns of renamed parameters."""
         normalized_names = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
-        answers = await self._access.read(self._unknown_names(normalized_names.values()), idle_timeout_s, probe=True)
+        names = normalized_names.values()
+        answers = await self._access.read(self._names_in_doubt(names), idle_timeout_s)
+        # A reboot while names are read clears the store, and then further names are unknown.
+        while to_read := [name for name in self._unknown_names(names) if name not in answers]:
+            answers |= await self._access.read(to_read, idle_timeout_s, probe=True)
         for requested, name in normalized_names.items():
             result = self._resolve_one(name, answers)
             if isinstance(result, ResolvedParameter):
@@ -110,6 +114,15 @@ class NameResolver:
     def _normalized(self, name: str) -> str:
         # ArduPilot accepts lower case, but confirms the parameter in upper case.
         return name.upper() if self._access.has_upper_case_names else name
+
+    def _names_in_doubt(self, names: Iterable[str]) -> list[str]:
+        """Return the vehicle's names of those parameters whose known values may be outdated."""
+        from aerokit.parameters.renames import resolve_rename
+
+        store = self._access.store
+        renamed = {name: None if name in store else resolve_rename(name, store) for name in names}
+        known_names = [name if rename is None else rename.name for name, rename in renamed.items()]
+        return [name for name in known_names if name in store and self._access.is_in_doubt(name)]
 
     def _unknown_names(self, names: Iterable[str]) -> dict[str, None]:
         """Return the old and new names of those parameters that are not known yet."""
