@@ -149,7 +149,7 @@ class CameraDefinition(Snapshot):
         return tuple(dependency for dependency in unique_names if dependency != name)
 
     def excluded_by(self, name: str, values: Values) -> tuple[str, ...]:
-        """Return the selected options that exclude a setting now, as texts such as ``CAM_EXPMODE = Auto``."""
+        """Return the selected options that exclude a setting, for example ``("CAM_EXPMODE = Auto",)``."""
         return tuple(
             f"{setting.name} = {option.name}"
             for setting, option in self._selected(values)

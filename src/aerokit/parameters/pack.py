@@ -157,8 +157,7 @@ def pack_for_download(
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
         # The last `unsplit_size` bytes of the entry must be in one block. For PX4, these are the value and its default.
-        # For ArduPilot (``whole_defaults=False``), they are the last number only. A value may be split if a default
-        # follows it (AP_Filesystem_Param.cpp).
+        # ArduPilot (``whole_defaults=False``) keeps only the last number whole (AP_Filesystem_Param.cpp).
         _, value_format = _CODES[code]
         unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size

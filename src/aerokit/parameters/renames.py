@@ -78,7 +78,7 @@ class Rename(Snapshot):
 
 
 class Renamed(Snapshot):
-    """A parameter that was requested under one name, and that the vehicle has under another name, ``name``."""
+    """A parameter that was ``requested`` by another name than its ``name`` on the vehicle."""
 
     requested: str
     name: str
@@ -88,7 +88,7 @@ class Renamed(Snapshot):
         """Convert a value from the program's to the vehicle's units.
 
         A value that is multiplied or divided is also rounded if ``type`` is an integer type. A value that the parameter
-        cannot have, such as NaN or a fraction of a bit mask, is not converted.
+        cannot have, such as NaN or a fraction of a bit mask, is returned unchanged.
         """
         converted = self._convert(value, self.requested)
         is_scaled = self._has_other_units and self.rename.divisor != 1 and math.isfinite(converted)

@@ -96,15 +96,16 @@ class Settings:
     def load(
         self, definition: CameraDefinition | str | os.PathLike[str], *, locale: str | None = None
     ) -> CameraDefinition:
-        """Use a camera definition, or read it from a file (``.xml`` or ``.xml.xz``).
+        """Set the camera definition that describes the settings.
 
         Args:
-            definition: result of :func:`aerokit.parameters.parse_definition`, or the path of a file.
-            locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
+            definition: the definition, or the path of its file (``.xml`` or ``.xml.xz``).
+            locale: language of descriptions and option names, such as ``"de"`` or ``"de_DE"``. Texts without a
+                translation are unchanged.
 
         Raises:
-            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition stays.
-            OSError: the file cannot be read.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition is kept.
+            OSError: the file cannot be read. The previous definition is kept.
         """
         from aerokit.parameters import load_definition
 
@@ -155,9 +156,9 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known values of other settings allow, as {name: value}.
+        """Return the present options of a setting as {name: value}; empty without a definition or without options.
 
-        Empty without a definition, and for settings without options.
+        The known values of other settings may exclude some options.
         """
         if self._definition is None:
             return MappingProxyType({})

@@ -69,7 +69,8 @@ class FileChannel:
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
-        # Sessions that are being closed in the background, by their ids: the request, and the task that repeats it.
+        # Maps the id of each session that is being closed in the background to the request that closes it, and to the
+        # task that sends this request.
         self._closing: dict[int, tuple[FtpRequest, asyncio.Task[None]]] = {}
 
     @asynccontextmanager
@@ -81,9 +82,10 @@ class FileChannel:
         idle_timeout_s: float,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Run one operation in a block, after the previous operations have ended.
+        """Wait until earlier operations have ended, then run the block as the next operation.
 
-        Raises FileTimeout after ``timeout`` seconds, with the ranges that ``missing()`` returns.
+        Raises FileTimeout if this takes more than ``timeout`` seconds. ``missing()`` returns the byte ranges that have
+        not arrived, for the error.
         """
         with _limit(description, timeout, missing):
             async with self._lock:
@@ -235,7 +237,7 @@ class LogChannel:
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._lock = asyncio.Lock()
-        # Task that waits until the vehicle confirms the end of the last failed operation; None if none has failed.
+        # Task that repeats LOG_REQUEST_END after a failed operation; None if no operation has failed.
         self._ending: asyncio.Task[None] | None = None
 
     async def list(
@@ -285,9 +287,9 @@ class LogChannel:
         timeout: float | None,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Run one operation in a block, after the previous one.
+        """Wait until earlier operations have ended, then run the block as the next operation.
 
-        Raises FileTimeout after ``timeout`` seconds, with the ranges that ``missing()`` returns.
+        Raises FileTimeout as :meth:`FileChannel.operation`.
         """
         with _limit(description, timeout, missing):
             async with self._lock:

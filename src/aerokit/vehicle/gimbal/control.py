@@ -248,7 +248,7 @@ class GimbalControl:
             await self._request_control()
             await self._await_confirmation(since)
         except (CommandRejected, NotSupported, BusyError):
-            # Control was not obtained, but an earlier block may have left the release of its control to this block.
+            # Control was not obtained. If an earlier block has left its release to this block, the release is due now.
             self._end()
             if self._control_request.must_release:
                 release.send_soon()

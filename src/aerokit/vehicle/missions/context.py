@@ -148,8 +148,8 @@ class PlanContext:
         frame, connection = ack.received_frame, self.session.connection
         is_from_autopilot = frame is not None and self.session.telemetry.accepts(frame)
         is_addressed = is_addressed_to(ack, connection.source_system, connection.source_component)
-        # The ack of another station arrives only on a shared link. That station may use the same ids as this program
-        # (255 and 190 by default), so an ack to these ids is ours only while this program transfers a plan.
+        # Another station on a shared link may use the same ids as this program (255 and 190 by default). An ack to
+        # these ids is therefore ours only while this program transfers a plan.
         is_ours = is_addressed and self.lock.locked()
         if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:
             return

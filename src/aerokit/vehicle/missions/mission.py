@@ -128,10 +128,7 @@ class MissionEndDetector:
         return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
-        """Return True if the mission has been complete for ``END_GRACE_S``.
-
-        Call this only while it is complete. The first call starts the time.
-        """
+        """Return True if the first call was at least ``END_GRACE_S`` ago. Call this only while the mission is complete."""
         now = self._session.connection.now()
         if self._completed_at is None:
             self._completed_at = now
@@ -200,10 +197,7 @@ class MissionEndDetector:
         return self._session.telemetry.mode.latest in self._landing_modes
 
     def _has_returned(self) -> bool:
-        """Return True if the vehicle is at home, or after ``RETURN_TIMEOUT_S``.
-
-        The first call starts this time.
-        """
+        """Return True if the vehicle is at home, or if the first call was more than ``RETURN_TIMEOUT_S`` ago."""
         session, now = self._session, self._session.connection.now()
         if self._return_began_at is None:
             self._return_began_at = now

@@ -301,7 +301,7 @@ class PlanTransfer(Generic[PlanT]):
             if not has_ftp:
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
-        # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
+        # ArduPilot refuses a mission file while it flies a mission, because it would clear the old mission first.
         is_refused = is_upload and self._mission_type == MavMissionType.MISSION and self._context.is_flying_mission
         return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
 
@@ -316,7 +316,6 @@ class PlanTransfer(Generic[PlanT]):
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
-        # The items are read back to verify them, or if the vehicle's answers to the upload were ambiguous.
         if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
         received = await self._read(method)
@@ -325,8 +324,9 @@ class PlanTransfer(Generic[PlanT]):
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
+            # The answers to the upload were ambiguous. The differences show that the vehicle refused the plan.
             raise MissionRejected(
-                f"{self._name}: the vehicle refused the plan at about item {result.item}; its items differ",
+                f"{self._name}: the vehicle refused the plan at about item {result.item}; its items differ from those sent",
                 result=MavMissionResult.ERROR,
                 item=result.item,
                 reasons=error.differences,

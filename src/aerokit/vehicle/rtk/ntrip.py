@@ -176,7 +176,7 @@ class NtripClient:
         self._send = send
         self._caster = caster
         self._timeout = timeout
-        # None: the caster's source table decides, and was not read yet.
+        # True if the vehicle's position is sent to the caster; None until the caster's source table has decided.
         self._sends_position = send_position
         self._name = f"NTRIP {caster!r}"
         # Ends the background task; `_ended` is set when the task has ended.

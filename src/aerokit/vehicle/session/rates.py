@@ -140,8 +140,7 @@ class MessageRates:
         """Request a message at ``hz`` or faster until the returned function is called.
 
         The rate is above 0 and at most 1000. ``is_optional`` means that the vehicle may lack the message, for example
-        because it lacks the sensor. If all requests for a message are optional, no event reports that it never
-        arrives.
+        because it lacks the sensor. A missing message is reported only if a request for it is not optional.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)

@@ -64,7 +64,7 @@ RETRY_INTERVAL_S = 3.0
 # it may belong to an earlier request, because PX4 acknowledges a command over each of its ports.
 MAX_MODE_REQUESTS = 3
 
-# Number of requests for the version that are sent at short intervals at first, and the interval in seconds.
+# The first requests for the version are sent quickly: their number, and the interval in seconds.
 EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
@@ -91,7 +91,7 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
 
 async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
     version = telemetry.version
-    # The first transfer waits for the capabilities in AUTOPILOT_VERSION, so it is requested at short intervals.
+    # AUTOPILOT_VERSION is requested at short intervals, because the first transfer waits for its capabilities.
     for _ in range(EAGER_REQUESTS):
         if version.is_known:
             return
@@ -262,9 +262,9 @@ class VehicleSession:
                 release()
 
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
-        """Raise OperationRejected if the vehicle is not known to be disarmed.
+        """Raise OperationRejected unless the vehicle is known to be disarmed.
 
-        Pass ``is_current=False`` if the last HEARTBEAT is too old to show the present state.
+        Pass ``is_current=False`` if the last HEARTBEAT is too old; the call then always raises.
         """
         if not self.telemetry.is_confirmed_disarmed or not is_current:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"

@@ -147,8 +147,7 @@ class Transfers:
     def command_in_background(self, command: int, *params: float, was_just_sent: bool = False) -> None:
         """Send an optional command without waiting for its ack. Failures are ignored.
 
-        ``was_just_sent`` means that the caller has sent the command already. It is then sent again only if no ack
-        arrives.
+        If the caller has just sent the command (``was_just_sent``), it is sent again only if no ack arrives.
         """
         send = self._send_command
 

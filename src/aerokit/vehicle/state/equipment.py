@@ -172,7 +172,7 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
-    """Return all sensors reported so far, with the new reading in RANGEFINDER (older ArduPilot) as sensor 0."""
+    """Return all sensors reported so far. Older ArduPilot sends RANGEFINDER, which becomes sensor 0."""
     return _replaced(
         context.before, RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN), _id_of
     )
@@ -254,7 +254,7 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
-    """Return the current in amperes; None if the number is one of the autopilot's values for "unknown"."""
+    """Return the current in amperes; None if it is unknown."""
     return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
 
 
