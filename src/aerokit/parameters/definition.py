@@ -365,8 +365,7 @@ class _Reader:
     def __init__(self, root: Element) -> None:
         self._root = root
         nodes = list(root.iterfind("parameters/parameter"))
-        # If a setting is defined several times, the first definition is used. In reversed order, it overwrites the
-        # others.
+        # If a setting is defined several times, the first definition is used. It must therefore enter the dict last.
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:

@@ -36,8 +36,8 @@ class Rename(Snapshot):
 
     Old values are divided by ``divisor``: 100 for centimetres that became metres. ``is_inverted`` is True for
     ARMING_CHECK (checks to make, 1 for all) and ARMING_SKIPCHK (checks to skip). ``vehicles`` are the vehicle types
-    that have the parameter. ``other_new`` are further names in new units, ``other_old`` further names in old units.
-    ``since`` is the ArduPilot version that introduced the new name.
+    that have the parameter. ``other_new`` are further names with the units of ``new``, ``other_old`` with those of
+    ``old``. ``since`` is the ArduPilot version that introduced the new name.
     """
 
     old: str
@@ -136,7 +136,7 @@ class Renamed(Snapshot):
 def find_rename(name: str, other: str = "") -> Rename | None:
     """Find a renamed parameter by any of its names; return None for parameters that were not renamed.
 
-    A few old names have several new names, one for each vehicle type: ``other`` selects one of these.
+    A few old names have a new name for each vehicle type. Pass one of the new names as ``other`` to select it.
     """
     return next((rename for rename in _by_name().get(name, ()) if not other or other in rename.names), None)
 
@@ -148,7 +148,7 @@ def other_names(name: str) -> tuple[str, ...]:
 
 
 def replacement_of(name: str) -> str:
-    """Return a text about what replaces a parameter that has no direct successor; empty if unknown."""
+    """Describe what replaces a parameter that has no one-to-one replacement; empty if unknown."""
     return REPLACED.get(name, "")
 
 

@@ -30,7 +30,7 @@ class ParameterTable(Mapping[str, Parameter]):
         values: Mapping[str, int | float],
         types: Mapping[str, ParameterType] = MappingProxyType({}),
     ) -> ParameterTable:
-        """Create a table from values, which are kept as they are. Parameters without a type become REAL32."""
+        """Create a table from values, without converting them. Parameters without a type become REAL32."""
         return cls(
             Parameter(name, value, types.get(name, ParameterType.REAL32), None, index)
             for index, (name, value) in enumerate(values.items())

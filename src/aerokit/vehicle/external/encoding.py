@@ -44,8 +44,8 @@ FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)
 class MeasurementEncoder:
     """Encodes measurements for one vehicle: each method returns the messages of one measurement.
 
-    A measurement that is out of range raises InvalidArgument. Time stamps are on the event loop's clock. PX4 converts
-    them to its own clock by the answers of `TimesyncAnswers`.
+    A measurement that is out of range raises InvalidArgument. Time stamps are on the event loop's clock, with which PX4
+    synchronizes by TIMESYNC.
     """
 
     def __init__(self, session: VehicleSession) -> None:

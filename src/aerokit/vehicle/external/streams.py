@@ -207,8 +207,8 @@ class MeasurementStream(Generic[MeasurementT]):
         if age_s > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
             self._dropped += 1
             return
-        # The next period begins when this one ends, even if this transmission is late, so that the average rate is
-        # right. After a longer pause, the next period is counted from now.
+        # A late transmission does not delay the following periods, so that the average rate is kept. After a pause of
+        # more than a period, the periods start again from now.
         next_period_at = self._next_at + self._period_s
         self._next_at = next_period_at if next_period_at > now else now + self._period_s
         for message in messages:

@@ -248,10 +248,7 @@ class Logs:
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
-        """Return the path of a log for MAVFTP, and the entry of the log.
-
-        If the path is None, the caller must download the log by LOG_* messages.
-        """
+        """Return the entry of a log, and its path for MAVFTP. A path of None means LOG_* messages."""
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
             path = await self._path(log, idle_timeout_s)
@@ -342,9 +339,9 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
 
 
 def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
-    """Return the entries of ``listed``, a newer list, whose logs are also in ``logs``."""
-    # Logs are compared by time and size, because a new log may get the id of an erased one. Only the newest log may
-    # have grown since, so it is found by its id.
+    """Return the entries of the newer list ``listed`` whose logs are also in ``logs``."""
+    # Logs are compared by time and size, because a new log may get the id of an erased one. The newest log may have
+    # grown since, so it is also found by its id.
     newest = logs[-1]
     kinds = {(entry.time_utc, entry.size) for entry in logs}
     return tuple(
@@ -403,7 +400,7 @@ async def log_path(
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             # When its logs are requested, PX4 writes a list file with one path for each log id.
             logs = await _read_list_file(files, directory, idle_timeout_s)
-            # Both sizes, in the list and in `log`, are from the time at which PX4 wrote the list.
+            # PX4 measured both sizes when it wrote the list, so a different size means a different log.
             has_same_size = log.id < len(logs) and logs[log.id].size == log.size
             return logs[log.id].path if has_same_size else None
     return None

@@ -305,7 +305,7 @@ class GimbalControl:
             orders.ask_in_background(GimbalManagerStatus.ID)
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device
-        # Another block may have been entered during the wait, or another gimbal may be the first one now.
+        # During the wait, another block may have been entered, or another gimbal may have become the first one.
         if self._is_primary in device.control_blocks:
             raise BusyError(f"{orders.name}: another block of this program already has control")
         self._device = device

@@ -42,8 +42,8 @@ class GimbalRegistry:
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
-        # Stands for the first gimbal until one is discovered. Then it has the state values of the first gimbal.
-        # MOUNT_STATUS has no gimbal id, so it sets only the values of this placeholder.
+        # Represents the first gimbal until one is discovered, and receives the values of the first gimbal afterwards.
+        # MOUNT_STATUS, which has no gimbal id, sets only the values of this placeholder.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
         # Requests of this program's `gimbal.control()` blocks that have not ended.
@@ -174,9 +174,9 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Record the sender as the manager of a gimbal, and return the gimbal.
+        """Return the gimbal if the sender of this message is its manager, otherwise None.
 
-        Returns None if another manager has a higher rank, or if the gimbal is unknown.
+        A sender that outranks the known manager becomes the manager.
         """
         frame = message.received_frame
         if frame is None:

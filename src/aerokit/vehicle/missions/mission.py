@@ -80,7 +80,7 @@ class MissionEndDetector:
         self._is_last_item_landing_or_return = last_command in LANDING_PURPOSES
         self._ends_by_return_without_landing = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
-        # Modes in which the vehicle may land. If the last item is a landing or a return, only its mode counts.
+        # Modes in which the vehicle may land: only that of the last item if this is a landing or a return.
         self._landing_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for command, purpose in LANDING_PURPOSES.items()
@@ -124,11 +124,11 @@ class MissionEndDetector:
             return completes_at_home or self._has_returned() or self._is_on_ground
         if self._ends_by_landing_or_return:
             return self._is_on_ground
-        # The last item is neither a landing nor a return. If the items are unknown, it may still be one of them.
+        # Known items do not end by a landing or a return here. Unknown items may, so their completion must last.
         return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
-        """Return True if the first call was at least ``END_GRACE_S`` ago. Call this only while the mission is complete."""
+        """Return True if the mission, which is complete now, has been complete for ``END_GRACE_S``."""
         now = self._session.connection.now()
         if self._completed_at is None:
             self._completed_at = now
@@ -440,14 +440,11 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item.
-
-        If ``keeps_jump_counts`` is False, setting item 0 also resets ArduPilot's jump counts.
-        """
+        """Set the current item."""
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
-            # ArduPilot also resets the jump counts if it gets the number 0, which is the number of home.
+            # The number 0 is home. ArduPilot then begins with the first item, and also resets its jump counts.
             number = 0 if item == 0 and not keeps_jump_counts else seq
             try:
                 await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)

@@ -326,7 +326,8 @@ class PlanTransfer(Generic[PlanT]):
                 raise
             # The answers to the upload were ambiguous. The differences show that the vehicle refused the plan.
             raise MissionRejected(
-                f"{self._name}: the vehicle refused the plan at about item {result.item}; its items differ from those sent",
+                f"{self._name}: the vehicle refused the plan at about item {result.item};"
+                " its items differ from those sent",
                 result=MavMissionResult.ERROR,
                 item=result.item,
                 reasons=error.differences,
@@ -354,7 +355,7 @@ class PlanTransfer(Generic[PlanT]):
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._mission_type, self._cache.updated_at)
             checksum = mission_checksum(items)
-            # Another station may have just replaced the plan, so the next report must have the same checksum.
+            # Another station may have just replaced the plan. The next report must therefore have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._mission_type, checksum):
                 self._cache.set(items, self._context.now(), checksum)
                 return True

@@ -259,10 +259,7 @@ class ParameterAccess:
 
     @contextmanager
     def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
-        """Raise the rate at which ArduPilot handles parameters during the block.
-
-        The rate is raised after ``after_s`` seconds, if the block lasts so long.
-        """
+        """Raise the rate at which ArduPilot handles parameters, from ``after_s`` seconds on until the block ends."""
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s == math.inf:
             yield

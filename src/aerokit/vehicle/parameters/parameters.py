@@ -88,11 +88,11 @@ class Parameters(ReadOnly):
         return self._metadata
 
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
-        """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
+        """Load the documentation of the parameters from a file.
 
-        Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
-        Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
-        The metadata of PX4 contains the defaults.
+        This is ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``,
+        which also contains the defaults. Metadata does not restrict writes: a value outside the documented range is
+        set, and its result has a ``note``. Metadata also identifies changes that need a reboot.
 
         Raises:
             FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
@@ -201,7 +201,7 @@ class Parameters(ReadOnly):
     ) -> dict[str, ParameterWrite]:
         """Set several parameters concurrently; return a result for each of them. Check the ``error`` of each result.
 
-        A parameter that appears only after another one was set (ArduPilot's ``…_ENABLE``) is set after the other one.
+        Parameters that ArduPilot has only while an ``…_ENABLE`` parameter is set may be set together with it.
 
         Raises:
             InvalidArgument: a name or value is invalid. Nothing was set.

@@ -196,10 +196,10 @@ class Transaction(_Block):
     written parameters, and the exception of the block propagates. :class:`aerokit.errors.RollbackFailed` names the
     parameters that could not be restored; aerokit does not try again when the link returns.
 
-    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the parameter.
-    Other tasks of your program may write at the same time: a transaction restores the values from before its own first
-    write. Blocks with the same parameter may be nested and may overlap; an outer block that fails also undoes an inner
-    block that succeeded.
+    A value that another station has changed meanwhile is not restored; a warning of logger "aerokit" names the
+    parameter. Other tasks of your program may write at the same time: a transaction restores the values from before
+    its own first write. Blocks that write the same parameter may be nested or overlap. An outer block that fails also
+    undoes an inner block that succeeded.
     """
 
     def __init__(

@@ -229,7 +229,7 @@ Resolve = Callable[[Iterable[str], float], Awaitable[dict[str, ResolvedParameter
 
 
 class _PlannedWrite(Snapshot):
-    """One requested value; ``to_send`` has the vehicle's name for the parameter and the value in the vehicle's unit."""
+    """One value to write: ``requested`` in the program's unit, and ``to_send`` with the vehicle's name and unit."""
 
     resolved: ResolvedParameter
     requested: int | float
@@ -263,7 +263,7 @@ class ParameterWriter:
     ) -> dict[str, ParameterWrite]:
         """Write the values, and return a result for each.
 
-        With ``upload``, only changed values are sent, by this method. Otherwise, all values are sent by PARAM_SET.
+        ``upload`` is the method by which only changed values are sent. Without it, all values are sent by PARAM_SET.
         ``resolve`` is called instead of :meth:`NameResolver.resolve`.
         """
         resolve = resolve or self.names.resolve

@@ -164,7 +164,6 @@ class CommandSender:
         return is_addressed_to(ack, self._connection.source_system, self._connection.source_component)
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
-        # The results of cancelled calls are recorded too.
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
     def is_unsupported(self, command: int, component_id: int | None = None) -> bool:

@@ -235,8 +235,7 @@ class MessageRates:
                 return
             refusal = error
         except CommandTimeout:
-            # If `request_again` was called meanwhile, it has reset the number of failures, and this failure is not
-            # counted.
+            # A failure from before a call of `request_again` does not count.
             if reset_count == self._reset_count:
                 stream.failures += 1
                 interval_s = min(2**stream.failures, MAX_RETRY_INTERVAL_S)
@@ -326,7 +325,7 @@ class MessageRates:
         if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
-        # If no message arrived in the first period of the window, the stream began later, so its average is too low.
+        # If no message arrived in the first period of the window, the stream began later. Its average is then too low.
         has_just_started = achieved_hz > 0 and stream.counts_at_checks[0] == stream.counts_at_checks[1]
         if has_just_started and not stream.is_slow:
             return

@@ -212,10 +212,7 @@ class VehicleSession:
         self.rates.close()
 
     def at_close(self, *functions: Detach) -> None:
-        """Register callbacks for the end of the vehicle's `async with` block.
-
-        After its end, they are called at once.
-        """
+        """Call these functions when the vehicle's `async with` block ends, or now if it has already ended."""
         self._detach_callbacks += functions
         if self.is_closed:
             for function in functions:

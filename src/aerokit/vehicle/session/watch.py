@@ -67,8 +67,8 @@ class VehicleWatch:
         self._on_reboot = on_reboot
         # Time at which the last HEARTBEAT arrived.
         self.last_heartbeat_at: float = heartbeat_at
-        # Time at which it was processed. The HEARTBEAT that found the vehicle may be old, but must not make the vehicle
-        # silent at once.
+        # Time at which the last HEARTBEAT was processed. The HEARTBEAT that found the vehicle may be old; the minimum
+        # keeps the vehicle from being silent at once.
         self._heartbeat_read_at = max(self.last_heartbeat_at, connection.now() - SILENT_AFTER_S)
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
         self._state_tracker = LinkStateTracker(
@@ -232,7 +232,7 @@ class VehicleWatch:
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        # Discard older times: later messages that are compared with them would show the same reboot again.
+        # Discard older times. A comparison with them would show the same reboot again.
         self._last_times = {clock: (milliseconds, now)}
         self._decreased_times = {}
         self._first_time = None

@@ -215,7 +215,7 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 def cell_voltages_mv(message: messages.BatteryStatus) -> list[int]:
     """Return the reported voltages, or an empty list if none is measured."""
-    # The voltages are those of single cells, or one of all cells together.
+    # These are the voltages of the single cells, or only the total voltage.
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
     # Cells 11 to 14 are an extension of the message, in which an absent cell may be 0 instead of U16.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
@@ -275,7 +275,7 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
-    """Return all outputs reported so far, with the new values of this message's port, which has 16 outputs."""
+    """Return all outputs reported so far, updated by this message, which has the 16 outputs of one port."""
     frame = message.received_frame
     # MAVLink 1 has no extension fields, so the message has only the first eight outputs of the port.
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT

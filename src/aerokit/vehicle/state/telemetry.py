@@ -38,9 +38,8 @@ Handler = Callable[[Any, Source], None]
 class Telemetry(States):
     """All state cells of one vehicle, updated by its messages.
 
-    It processes messages of component ``component_id`` (the autopilot) of system ``system_id``, and messages without a
-    frame, which the program itself has built. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT
-    shows which autopilot this is.
+    It processes the messages of the autopilot (``system_id``, ``component_id``), and messages that your program has
+    built, which have no frame. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT determines it.
     """
 
     autopilot: Autopilot
@@ -198,7 +197,7 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        # Calls may be nested, because a handler may read a cell, which then decodes another message.
+        # Restored below, because calls may be nested: a handler may read a cell, which then decodes another message.
         outer_arrived_at = self._arrived_at
         # The cells get the time at which the frame arrived as their timestamp.
         self._arrived_at = None if frame is None else frame.received_at
