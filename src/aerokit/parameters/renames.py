@@ -174,9 +174,8 @@ def translate_values(
     """Convert the values of a file or table to the names and units that a vehicle uses.
 
     ``known`` are the names of the vehicle's parameters, and ``types`` their types, for rounding. A parameter that the
-    vehicle has under no name keeps its name and value. If ``values`` has a parameter under several names, the value
-    under the vehicle's name is used. If that name is missing, the last value is used. The second result lists the
-    converted parameters.
+    vehicle does not have keeps its name and value. If ``values`` contains several names of one parameter, the vehicle's
+    own name takes precedence, otherwise the last name. The second result lists the converted parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []

@@ -131,7 +131,7 @@ ParameterValues = Mapping[str, "int | float"] | Mapping[str, Parameter]
 
 
 class ParameterDifference(Snapshot):
-    """A parameter whose values differ. ``before`` or ``after`` is None if the parameter is missing there."""
+    """A parameter that differs between two tables. ``before`` or ``after`` is None if that table lacks it."""
 
     name: str
     before: int | float | None

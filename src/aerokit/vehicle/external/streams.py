@@ -159,7 +159,7 @@ class MeasurementStream(Generic[MeasurementT]):
         assumes_constant = health.flags & CONSTANT_POSITION and not is_flag_expected
         if assumes_constant or not has_position:
             return "not used"
-        # The first parameter selects the source of the position; the vehicle need not have the others.
+        # The first parameter selects the source of the position and must exist. The others may be missing.
         selecting_parameter, _ = rule.sole_source[0]
         is_sole_source = selecting_parameter in self._parameters and all(
             self._parameters[name] in allowed for name, allowed in rule.sole_source if name in self._parameters

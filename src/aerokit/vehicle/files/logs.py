@@ -286,8 +286,8 @@ class Logs:
         With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
         """
         log_id = log if isinstance(log, int) else log.id
-        # For an id, the whole list is requested, because the log may not exist. ArduPilot answers the request for a
-        # single nonexistent log by a list of nonexistent logs that does not end until LOG_REQUEST_END.
+        # For an id, request the whole list, because the log may not exist. ArduPilot answers the request for a single
+        # nonexistent log by an endless list of nonexistent logs.
         only_id = None if isinstance(log, int) else log.id
         max_unanswered = MAX_UNANSWERED_REQUESTS if gives_up_early else None
         async with self._channel.operation(f"log {log_id}", timeout):

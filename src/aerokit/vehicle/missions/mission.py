@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# Maps commands that land the vehicle at the end of a mission to the purpose of the mode in which it may then land.
+# Maps commands that land the vehicle at the end of a mission to the mode in which it may do so.
 LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: "return",
     MavCmd.NAV_LAND: "land",
@@ -53,11 +53,11 @@ RETURN_TIMEOUT_S = 300.0
 class MissionEndDetector:
     """Detects the end of a mission.
 
-    Usually, a mission has ended when the vehicle reports completion or, if it reports no mission state, when the last
-    item is reached. These missions end later:
+    The vehicle must report completion or, if it reports no mission state, must have reached the last item. Some
+    missions end later:
 
     - If the last item is a landing, or a return with a landing, the vehicle must also be on the ground, because PX4
-      reports completion when the return starts. If it disarms in the mode of this item, no report is needed.
+      reports completion when the return starts. A vehicle that disarms in the mode of this item needs no report.
     - If the last item is a return without a landing, the vehicle must be at home.
     - If the items are unknown, the mode after the completion shows whether the vehicle still lands.
 

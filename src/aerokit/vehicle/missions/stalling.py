@@ -33,9 +33,9 @@ _WAYPOINTS = (MavCmd.NAV_WAYPOINT, MavCmd.NAV_SPLINE_WAYPOINT)
 class MissionStallDetector:
     """Detects a fall, and a vehicle that does not move although its mission item requires movement.
 
-    A fall is a fast descent that is followed at once by 12 s of standstill. It is reported on the ground, and at an item
-    that requires movement. At such an item, a standstill of ``MISSION_STALL_TIMEOUT_S`` is reported even without a
-    descent. A paused or disarmed vehicle is never reported.
+    A fall is a fast descent that is followed at once by 12 s of standstill. It is reported on the ground, and at an
+    item that requires movement. At such an item, a standstill of ``MISSION_STALL_TIMEOUT_S`` is reported even without
+    a descent. A paused or disarmed vehicle is never reported.
 
     Items are known only after an upload or a download, and require movement only in the mission mode.
     """

@@ -252,9 +252,10 @@ class Parameters(ReadOnly):
         """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
         They are also restored if the block raises or is cancelled; this takes at most three times ``idle_timeout_s``.
-        If one value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
-        overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
-        before the first block. If another station has changed a value meanwhile, that value stays, and a warning of
+        If one value cannot be set, all other values are restored and the error is raised.
+
+        Blocks that set the same parameter may be nested or overlap. When the last of them ends, the parameter gets its
+        value from before the first. A value that another station has changed meanwhile is not restored; a warning of
         logger "aerokit" names the parameter.
 
         Raises:

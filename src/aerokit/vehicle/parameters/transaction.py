@@ -73,7 +73,7 @@ class _Block:
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
         unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
-        # The store may be outdated, so the vehicle's values are saved.
+        # Save the vehicle's present values, because the store may be outdated.
         answers = await self._access.read(unread_names, idle_timeout_s)
         if self._has_ended:  # A write by another task must not outlive the block, because nothing would restore it.
             raise InvalidArgument("the `async with` block has ended; the remaining parameters were not set")
@@ -81,9 +81,9 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # The answer may lack the last bits of a float, so the store's value is used if both are equal up to
-            # rounding. Otherwise the store is out of date: another station has just undone our write, and the store
-            # took the vehicle's message about this for a late one.
+            # If both values are equal up to rounding, use the stored one, because the answer may lack the last bits of
+            # a float. Otherwise the store is out of date: another station has just undone our write, and the store has
+            # ignored the message about this (`mark_replaced`).
             known = self._access.store.get(name) or answer
             current[name] = known if same_value(float(known.value), float(answer.value)) else answer
             if name not in self._saved:

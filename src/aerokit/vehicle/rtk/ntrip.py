@@ -294,8 +294,8 @@ class NtripClient:
         finally:
             if position_task is not None:
                 position_task.cancel()
-                # If sending the position has failed, reading has failed, too. The reason comes from the reader, so the
-                # task's exception is ignored.
+                # Ignore the task's exception. If sending the position has failed, reading has failed too, which gives
+                # the reason.
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {message_count} messages")

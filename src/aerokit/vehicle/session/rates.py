@@ -80,7 +80,7 @@ class _Stream:
 
     @property
     def needed_hz(self) -> float:
-        """The highest needed rate that was not refused. If there is none, 0: the autopilot's own rate."""
+        """The highest requested rate that the vehicle has not refused; ``AUTOPILOT_DEFAULT`` if there is none."""
         return max((hz for hz in self.requests.values() if hz not in self.refused_hz), default=AUTOPILOT_DEFAULT)
 
     @property

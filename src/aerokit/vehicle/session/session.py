@@ -191,8 +191,7 @@ class VehicleSession:
 
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         self.telemetry.receive(heartbeat)
-        # A message with a default rate may be missing. If a message that the program has named is missing, it is
-        # reported.
+        # A missing message is reported only if the program has named it.
         are_default = rates is None
         requested_rates = self.telemetry.default_rates if rates is None else rates
         for message_type, hz in requested_rates.items():

@@ -177,6 +177,6 @@ class Transfers:
                 if self._request_version is not None:
                     await self._request_version()
                 await self._version.wait_until(lambda _: True)
-            # There is no `request_version` for an autopilot, because its session requests the version until it arrives.
+            # An autopilot has no `request_version`: its session requests the version until it arrives.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
         return self.known_capabilities

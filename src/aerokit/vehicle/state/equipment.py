@@ -259,7 +259,7 @@ def current(centiampere: int, autopilot: Autopilot) -> float | None:
 
 
 def power(message: messages.PowerStatus) -> Power:
-    """Return the supply voltages; None for a 0 in the message, which means that the voltage is not measured."""
+    """Return the supply voltages. A voltage that is not measured (0 in the message) is None."""
     return Power(
         divided(message.Vcc, 1000, unknown=0),
         divided(message.Vservo, 1000, unknown=0),
@@ -352,8 +352,8 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    Yaws from the nose and from north are converted by ``delta_yaw`` in the message, or by the vehicle's ``heading`` in
-    degrees. While both are unknown, the yaw that would need the conversion is None.
+    Yaw from the nose and yaw from north are converted to each other by ``delta_yaw`` in the message, or by the
+    vehicle's ``heading`` in degrees. If both are unknown, the result has only the yaw in the message.
     """
     pitch, roll, yaw = _euler(message.q)
     # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.

@@ -166,10 +166,10 @@ _HEADER_LENGTH = 9
 class StreamedMessage:
     """One message type of a vehicle's autopilot. Keeps the latest frame, and decodes it when a value is read.
 
-    ``instance_at`` is the offset in the payload of the byte that distinguishes several instances. The latest frame of
-    each instance is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None if the frame is not decoded
-    yet. While one of the cells has observers, each frame is decoded when it arrives. Any thread may read a cell, so
-    ``lock`` protects this object.
+    ``instance_at`` is the payload's offset of the instance number, None without one. The latest frame of each instance
+    is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None if the frame is not decoded yet. While one
+    of the cells has observers, each frame is decoded when it arrives. Any thread may read a cell, so ``lock`` protects
+    this object.
     """
 
     __slots__ = (

@@ -236,8 +236,9 @@ def wind(message: messages.Wind) -> Wind:
 
 
 def wind_of_covariance(message: messages.WindCov) -> Wind | None:
-    """Return the wind in WIND_COV (PX4); None if unknown. The message has the direction that the air moves to."""
+    """Return the wind in WIND_COV (PX4); None if unknown."""
     if not (math.isfinite(message.wind_x) and math.isfinite(message.wind_y)):
         return None
+    # The message has the direction that the air moves to.
     comes_from = math.degrees(math.atan2(-message.wind_y, -message.wind_x))
     return Wind(math.hypot(message.wind_x, message.wind_y), geo.wrap_360(comes_from), finite(message.wind_z))

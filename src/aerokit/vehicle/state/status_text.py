@@ -93,8 +93,8 @@ class StatusTextAssembler:
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
-                # A router has forwarded this chunk twice. The connection itself drops copies that arrive over another
-                # link (`MergedStreams`), so late copies are not expected here.
+                # A router has forwarded this chunk twice. Copies that arrive over another link are dropped earlier, by
+                # `MergedStreams`.
                 return
             # A new text with the same id begins, so the end of the previous text was lost.
             yield self._incomplete.pop(key).truncated(now)

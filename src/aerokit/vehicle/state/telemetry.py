@@ -58,7 +58,7 @@ class Telemetry(States):
         self._knows_autopilot = autopilot is not None
         self._clock = clock
         self._lock = threading.RLock()  # Any thread may read a cell, and reading decodes pending frames.
-        # Arrival time of the message that is being processed; None if it has no frame, and between messages.
+        # Arrival time of the frame that is being processed; None if there is none.
         self._arrived_at: float | None = None
         self._texts = StatusTextAssembler()
         self.has_available_modes: bool = False
@@ -219,7 +219,7 @@ class Telemetry(States):
             for update in updates:
                 update(message, source)
 
-        # A ground station or companion may send heartbeats with the autopilot's ids; these update no cell.
+        # Ignore heartbeats that a ground station or companion sends with the autopilot's ids.
         def on_heartbeat(message: Any, source: Source) -> None:
             if self._accept_heartbeat(message):
                 update_all(message, source)
