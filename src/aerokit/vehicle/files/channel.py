@@ -163,9 +163,8 @@ class FileChannel:
                 reply = await self.transfers.run(request)
             except FileError as error:
                 if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
-                    # The file was requested more than once. An earlier request may have opened the session that is now
-                    # in use, if its reply was lost. Close this session. PX4 has only one, which may also belong to
-                    # another station. That station must then open its file again.
+                    # If the reply to an earlier request was lost, this program may already have a session. Close it.
+                    # PX4 has only one session: if it belongs to another station, that station must open its file again.
                     may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)

@@ -32,7 +32,7 @@ UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
 HEADING_MAX_AGE_S = 5.0
 # A component counts as gone if it is silent for this many seconds while the autopilot is not.
 MAX_SILENCE_S = 10.0
-# Precedence of managers. A device that manages itself has at least RANK_INFORMATION.
+# Precedence of managers, by the message that shows that a component is one. The autopilot always has the highest rank.
 RANK_STATUS, RANK_INFORMATION, RANK_AUTOPILOT = 1, 2, 3
 
 

@@ -139,7 +139,7 @@ class MissionEndDetector:
     def _ends_by_landing_or_return(self) -> bool:
         if self._are_items_known:
             return self._is_last_item_landing_or_return
-        # The items are unknown, so the vehicle's mode after the completion shows the landing or the return.
+        # The items are unknown, but the vehicle's mode after the completion shows whether it lands.
         is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
 
@@ -165,8 +165,8 @@ class MissionEndDetector:
         if is_mode_expected and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
-        # The end of the mission also changes the mode. The vehicle may report the mode before the end, so wait for
-        # END_GRACE_S and for a MISSION_CURRENT before the mode counts as a failure.
+        # The mode also changes at the end of the mission, which may be reported a little later than the mode. Another
+        # mode is therefore a failure only after END_GRACE_S and a MISSION_CURRENT.
         if self._left_at is None:
             self._left_at = now
         has_report = self._tracker.progress.updated_at > self._left_at
@@ -498,7 +498,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         await self._order_mode(mode, order, timeout)
-        self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
+        self._tracker.discard_completion()  # Until now, the vehicle may have reported the end of the previous flight.
 
     async def _order_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle_context, session = self._vehicle_context, self._session
@@ -508,8 +508,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                # No refusals are watched here, because only PX4 refuses a command after it has accepted it, and PX4
-                # does not get MISSION_START.
+                # Only PX4 refuses commands after it has accepted them, and PX4 does not get MISSION_START.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )

@@ -305,7 +305,7 @@ class ParameterAccess:
         known = [self.store.get(name) for name in names]
         old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
         self._forget_written(names)
-        # Recently written parameters are read back, so their answers take as long as those of reads.
+        # Recently written parameters are verified by a read, which ArduPilot answers more slowly than a write.
         recent = self._recently_written() & set(names)
         exchange = ParameterWrites(
             transfers.system_id,

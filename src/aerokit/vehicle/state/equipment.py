@@ -337,11 +337,8 @@ def from_status(message: MountStatus) -> GimbalAttitude:
 
 
 def from_orientation(message: MountOrientation, heading: float | None) -> GimbalAttitude:
-    """Return the attitude of MOUNT_ORIENTATION, whose yaw from north may be missing.
-
-    ``heading`` is the vehicle's heading in degrees. While that is unknown too, ``yaw_deg`` is None.
-    """
-    # ``yaw_absolute`` is an extension field: 0 may mean that it was not sent.
+    """Return the attitude of MOUNT_ORIENTATION. ``heading`` is the vehicle's heading in degrees, None if unknown."""
+    # ``yaw_absolute`` (from north) is an extension field: 0 may mean that it was not sent.
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
         yaw = _rounded_to_360(message.yaw_absolute)
     else:

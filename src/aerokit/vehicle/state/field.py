@@ -166,10 +166,10 @@ _HEADER_LENGTH = 9
 class StreamedMessage:
     """One message type of a vehicle's autopilot. Keeps the latest frame, and decodes it when a value is read.
 
-    ``instance_at`` is the payload's offset of the instance number, None without one. The latest frame of each instance
-    is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None if the frame is not decoded yet. While one
-    of the cells has observers, each frame is decoded when it arrives. Any thread may read a cell, so ``lock`` protects
-    this object.
+    ``instance_at`` is the offset of the instance number in the payload, None if the message has none. The latest frame
+    of each instance is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None if the frame is not
+    decoded yet. While one of the cells has observers, each frame is decoded when it arrives. Any thread may read a
+    cell, so ``lock`` protects this object.
     """
 
     __slots__ = (
@@ -195,8 +195,7 @@ class StreamedMessage:
         self._cells = cells
         self._apply = apply
         self._lock = lock
-        # Offset of the instance byte in `Frame.body` (the argument is its offset in the payload); None if there is only
-        # one instance.
+        # Offset of the instance number in `Frame.body`, None if the message has none.
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
         # The first frame that arrives at or after this time is decoded at once.
         self._decode_from = -math.inf

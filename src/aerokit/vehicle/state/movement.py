@@ -121,10 +121,8 @@ class Wind(Snapshot):
 
 
 def valid_coordinates(latitude: int, longitude: int) -> tuple[float, float] | None:
-    """Convert 1e-7 degrees to degrees; return None for a place near 0°N 0°E, and for numbers out of range.
-
-    Autopilots without a fix report 0, 0 or a place near it: ArduPlane was observed to dead-reckon from 0, 0.
-    """
+    """Convert 1e-7 degrees to degrees; return None for a place near 0°N 0°E, and for numbers out of range."""
+    # Autopilots without a fix report 0°N 0°E. ArduPlane was also observed to dead-reckon from there.
     if abs(latitude) < MIN_COORDINATE and abs(longitude) < MIN_COORDINATE:
         return None
     if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
