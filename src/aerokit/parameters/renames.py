@@ -155,7 +155,7 @@ def replacement_of(name: str) -> str:
 def resolve_rename(name: str, known: Container[str]) -> Renamed | None:
     """Find the other name under which a vehicle has parameter ``name``. ``known`` are the names of its parameters.
 
-    Returns None if the vehicle has the parameter under ``name`` itself, or under no name.
+    Returns None if the vehicle has ``name`` itself, or has no such parameter.
     """
     if name in known:
         return None
@@ -234,8 +234,8 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
             two_way.update(dict.fromkeys(rename.names, rename))
     for since, vehicles, divisor, pairs in OLDER:
         for old, new in _pairs(pairs):
-            # If the new name was renamed again later, both renames become one with several old names. The units changed
-            # only at the later rename, so its divisor applies to all of them.
+            # If the new name was renamed again later, both renames become one with several old names. Its divisor is
+            # that of the later rename, because the earlier one did not change the units.
             rename = two_way.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
             if old not in rename.names:
                 rename = rename.replace(other_old=(*rename.other_old, old))

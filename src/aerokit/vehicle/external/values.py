@@ -181,9 +181,9 @@ class FlowMeasurement(Snapshot):
     """Optical flow of a camera that looks down (OPTICAL_FLOW, OPTICAL_FLOW_RAD).
 
     ``x_rad`` and ``y_rad`` are the movement of the picture within ``interval_s``, as angles about the body's forward
-    and right axes. For a camera that only turns, they are the angles of its turn. ``gyro_rad`` has the angles by which
-    the body really turned, about all three axes; do not subtract them from ``x_rad`` and ``y_rad``. ``quality`` is from
-    0 to 255. Send every measurement without gaps: ArduPilot uses the time between two messages as ``interval_s``.
+    and right axes. They include the rotation of the body: do not subtract ``gyro_rad``, which is this rotation about
+    all three axes. ``quality`` is from 0 to 255. Send every measurement without gaps: ArduPilot uses the time between
+    two messages as ``interval_s``.
     """
 
     x_rad: float

@@ -153,11 +153,12 @@ class GimbalControl:
     """Control of a gimbal for the duration of its ``async with`` block (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
 
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
-    releases control, without waiting if the block exits by an error or cancellation. When another station takes
-    control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken unless your program
-    already knows of the loss, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
-    system and component id cannot be detected.
+    releases control, without waiting if the block exits by an error or cancellation.
+
+    When another station takes control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including
+    running ones, raise :class:`GimbalTaken`. If neither an order nor :meth:`until_lost` has told your program of the
+    loss, leaving the block raises GimbalTaken. Another station that uses your own system and component id cannot be
+    detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.

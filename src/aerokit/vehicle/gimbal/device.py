@@ -136,8 +136,8 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# If a status has a lower time stamp than the newest one, it arrived late. If it is lower by this many milliseconds or
-# more, the manager has rebooted instead.
+# A status whose time stamp is lower than the newest one arrived late. If it is lower by this many milliseconds or more,
+# the manager has rebooted.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"

@@ -191,7 +191,7 @@ class GimbalRegistry:
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
         else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
             device = self._device_of(message, device_id)
-            # The sender's status about one of its own gimbals counts like GIMBAL_MANAGER_INFORMATION.
+            # A status about the sender's own gimbal is as reliable as GIMBAL_MANAGER_INFORMATION.
             rank = max(rank, RANK_INFORMATION)
         if device is None:
             return None

@@ -43,7 +43,7 @@ STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Orders to ``device``. If it is None, each order goes to the gimbal that is then the first.
+    """Sends orders to ``device``, or to the first gimbal if ``device`` is None.
 
     A new order ends the wait for the previous one.
     """

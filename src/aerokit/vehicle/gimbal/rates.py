@@ -117,7 +117,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        """Stop the gimbal. If the stream has already stopped, raise its error, unless it was raised before."""
+        """Stop the gimbal. If the stream has already stopped, raise its error instead."""
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:
             self._stop(reason, hold=False)

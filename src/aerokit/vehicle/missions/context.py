@@ -121,7 +121,7 @@ class PlanContext:
     def version(self, mission_type: int) -> tuple[int, int]:
         """Return a value that changes whenever this program notices a change of the vehicle's plan."""
         cache = self.caches[mission_type]
-        # `changes` also counts the plans of other stations on a shared link. The plan's id is 0 except on PX4.
+        # `changes` also counts the plans of other stations on a shared link. Only PX4 has a plan id other than 0.
         return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
@@ -172,8 +172,8 @@ class MissionTracker:
     """State values and events for mission progress. Items are numbered from 0, without home.
 
     If the mission of an ArduCopter ends with a landing, the vehicle disarms and reports its first item as current, but
-    never reports the mission as complete. PX4 reports completion until the next mission has started. It reports an
-    active mission even in its landing mode, and sends each MISSION_ITEM_REACHED ten times.
+    never reports the mission as complete. PX4 reports completion until the next mission has started. PX4 also reports
+    an active mission in its landing mode, and sends each MISSION_ITEM_REACHED ten times.
     """
 
     def __init__(self, session: VehicleSession) -> None:

@@ -42,8 +42,8 @@ LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
 # Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 
-# On a bad link, several MISSION_CURRENTs may be lost, so a later one is awaited before the mission counts as
-# interrupted. A vehicle may also send none.
+# On a bad link, several MISSION_CURRENTs may be lost. The mission counts as interrupted if the next one does not report
+# the end, or if none arrives within this many seconds.
 END_REPORT_TIMEOUT_S = 10.0
 
 # A return may end at a rally point, whose position is unknown here, so it counts as finished after this time.
@@ -96,7 +96,7 @@ class MissionEndDetector:
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
         # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
-        # On the ground, the mission has ended only if the vehicle has landed, and not fallen.
+        # On the ground, the mission has ended only if the vehicle has landed instead of fallen.
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
@@ -132,7 +132,7 @@ class MissionEndDetector:
         now = self._session.connection.now()
         if self._completed_at is None:
             self._completed_at = now
-        # PX4 reports completion when a return or a landing begins. HEARTBEAT may report the new mode a little later.
+        # PX4 reports completion when a return or a landing begins, which HEARTBEAT may show a little later.
         return now - self._completed_at >= END_GRACE_S
 
     @property
@@ -260,8 +260,8 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Args:
             item: number of the item.
-            timeout: only for MISSION_SET_CURRENT. Seconds to wait until a running transfer has ended, and as many again
-                until MISSION_CURRENT confirms the item.
+            timeout: only for MISSION_SET_CURRENT: seconds for each of two steps, the end of a running transfer and the
+                confirmation by MISSION_CURRENT.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -359,10 +359,11 @@ class MissionControl(VehiclePlan["Mission"]):
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait. If a pilot then changes to another mode than that of the
-        mission, the wait ends. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An
-        upload or a download shows whether the mission ends with a landing. Without them, or after another station has
-        replaced the mission, the mode after the completion shows whether the vehicle lands.
+        A :meth:`pause` by another task does not end the wait, but a pilot who then changes the mode does. Cancelling
+        this call does not stop the vehicle, and no command is sent when it fails.
+
+        aerokit knows from an upload or a download whether the mission ends with a landing. Otherwise, or after another
+        station has replaced the mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
         items and the mission id (PX4 1.15 and later). On a shared link, the vehicle's answer to the other station also

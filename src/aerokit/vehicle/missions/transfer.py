@@ -244,7 +244,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # Item 0 must be the vehicle's home, because older firmware may set its home to item 0.
+        if self._offset:  # Item 0 must be the vehicle's home, because older firmware may use it as the new home.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()

@@ -50,8 +50,8 @@ class Parameters(ReadOnly):
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters. For names that are not known yet, it raises the rate after half a second.
-    It restores the rate at the end.
+    while it reads more than five parameters, and restores the rate at the end. For unknown names, which the vehicle may
+    not have, it raises the rate after half a second.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.

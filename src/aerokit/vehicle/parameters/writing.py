@@ -305,10 +305,7 @@ class ParameterWriter:
         *,
         is_first: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
-        """Return the planned writes and the errors.
-
-        ``is_first`` is True in the first round of writes. An invalid value then raises InvalidArgument.
-        """
+        """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
         plans: list[_PlannedWrite] = []
         first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
         errors: dict[str, AerokitError] = {}

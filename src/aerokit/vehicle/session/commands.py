@@ -215,9 +215,9 @@ class CommandSender:
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
-                # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command. If they arrived
-                # while this call waited for the lock, the command is repeated. This is harmless, because only commands
-                # that stop or release something are sent this way.
+                # The acks that `send_unconfirmed` has recorded as pending belong to this call. If they have arrived
+                # already, the command is repeated. This is harmless, because only commands that stop or release
+                # something are sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
@@ -267,8 +267,8 @@ class CommandSender:
     def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
         """Record acks that may still arrive, so that the next command ignores them.
 
-        ``count`` is the number of acks that the last command may still get. ``earlier_records`` are the times that
-        :meth:`_pop_pending_acks` has returned, without those of the acks that have arrived since.
+        ``count`` is the number of acks that the last command may still get. ``earlier_records`` are those from
+        :meth:`_pop_pending_acks` whose acks have still not arrived.
         """
         new_records = [self._connection.now()] * count
         if earlier_records or new_records:

@@ -308,7 +308,7 @@ class VehicleSession:
 
     def with_reasons(self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()) -> CommandRejected:
         """Return the error with ``reasons`` and with the vehicle's status texts from ``since`` on."""
-        # Informational texts such as "ArduPilot Ready" are no reasons, but known refusals always are.
+        # Informational texts such as "ArduPilot Ready" are left out, unless they are known refusals.
         texts = [
             text.text
             for text in self.telemetry.texts_since(since)

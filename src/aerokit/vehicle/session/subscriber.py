@@ -165,7 +165,7 @@ class ComponentSubscriber:
 class WatchedStream:
     """Requests the message of a state cell only while the program waits for the cell or iterates over its values.
 
-    ``request`` returns None if the message need not be requested now. This `Feed` of the cell decodes nothing.
+    ``request`` returns None if the message need not be requested now.
     """
 
     pending = False
