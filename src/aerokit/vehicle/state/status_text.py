@@ -47,7 +47,7 @@ class StatusTextAssembler:
     def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
         """Add one message. Return the texts that are complete or truncated now.
 
-        By the standard, a text with the id 0 is not chunked. With ``joins_id_0``, it is treated like other texts.
+        By the standard, a text with the id 0 has a single chunk. Pass ``joins_id_0`` if it may have several.
         """
         truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
