@@ -74,7 +74,7 @@ def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | 
 
 
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
-    """Return the value in a message. The value of a received message is exact to the bit."""
+    """Return the value in a PARAM_VALUE, exact to the bit if the message was received."""
     type_ = ParameterType.from_wire(message.param_type)
     if not bytewise or not math.isnan(message.param_value):
         return from_wire(message.param_value, type_, bytewise)

@@ -166,7 +166,7 @@ class Settings:
         return MappingProxyType({option.name: option.value for option in options})
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """Return the settings that make a setting ineffective now, e.g. ``("CAM_EXPMODE = Auto",)``."""
+        """Return the selected options that exclude a setting, for example ``("CAM_EXPMODE = Auto",)``."""
         return () if self._definition is None else self._definition.excluded_by(name, self._values())
 
     async def download(
@@ -199,7 +199,7 @@ class Settings:
                     if self._reboots != reboots_before:
                         continue  # A part of the list is from before the reboot.
                     unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
-                    # Values in `_known` are newer than those in the list, because `_store` has recorded every message.
+                    # Prefer the values in `_known`, because `_store` has also recorded the messages during the download.
                     self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
                     self._is_complete = True
                     break

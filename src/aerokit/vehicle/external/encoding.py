@@ -397,8 +397,8 @@ def _triangle(linear_variance: float | None, angular_variance: float | None) -> 
     triangle = [0.0] * TRIANGLE_SIZE
     for indexes, variance in ((POSITION_DIAGONAL, linear_variance), (ORIENTATION_DIAGONAL, angular_variance)):
         for index in indexes:
-            # For an angular variance of 0, both autopilots use the minimum in their parameters. ArduPilot does not
-            # accept NaN there.
+            # An unknown variance is sent as 0, for which both autopilots use a minimum from their parameters. ArduPilot
+            # does not accept NaN here.
             triangle[index] = variance or 0.0
     if linear_variance is None:
         # NaN in the first element means that the linear variance is unknown.

@@ -167,7 +167,7 @@ class MeasurementStream(Generic[MeasurementT]):
         return "used" if is_sole_source else "unknown"
 
     def send(self, measurement: MeasurementT) -> None:
-        """Send a measurement now, or at the end of the period if another measurement was already sent in it.
+        """Send a measurement: now, or when the period of the previous measurement ends.
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.

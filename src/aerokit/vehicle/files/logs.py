@@ -248,7 +248,7 @@ class Logs:
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
-        """Return the entry of a log, and its path for MAVFTP. A path of None means LOG_* messages."""
+        """Return a log's path for MAVFTP (None: use LOG_* messages instead), and its entry."""
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
             path = await self._path(log, idle_timeout_s)

@@ -102,7 +102,7 @@ class RestTarget:
 
     def _is_direction_known(self, device: GimbalDevice) -> bool:
         attitude, source = device.attitude.value, device.attitude.source
-        # MOUNT_STATUS has no yaw from the nose, so its pitch decides.
+        # MOUNT_STATUS has no yaw from the nose, so its pitch is sufficient.
         has_no_yaw = source is not None and source.message == "MOUNT_STATUS"
         return attitude.pitch_deg is not None and (attitude.yaw_from_nose_deg is not None or has_no_yaw)
 

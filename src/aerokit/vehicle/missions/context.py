@@ -198,7 +198,7 @@ class MissionTracker:
         self._last_item_current_at = -math.inf
         # True if the vehicle flies to the item in `reached` once more.
         self._is_approached_again = False
-        # True if the vehicle has flown the mission since the mission last ended.
+        # True once the vehicle has flown the mission, until the mission ends.
         self._was_active = False
         # A report of completion before this time may be about the previous flight.
         self._stale_until = -math.inf

@@ -124,7 +124,7 @@ class MissionEndDetector:
             return completes_at_home or self._has_returned() or self._is_on_ground
         if self._ends_by_landing_or_return:
             return self._is_on_ground
-        # Known items do not end by a landing or a return here. Unknown items may, so their completion must last.
+        # Known items do not end by a landing or a return here. Unknown items may, which the mode shows a little later.
         return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:

@@ -33,8 +33,8 @@ class ParameterStore:
 
     def __init__(self, transfers: Transfers, on_discarded: Callable[[str, float], None]) -> None:
         self._transfers = transfers
-        # Called when `mark_replaced` makes a message ignored. The arguments are the parameter's name and the time at
-        # which this ends.
+        # Called for each message that is ignored (see `mark_replaced`), with the parameter's name and the time at which
+        # this ends.
         self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table; None until it is built again after a change.

@@ -332,7 +332,7 @@ class GimbalAttitude(Snapshot):
 
 
 def from_status(message: MountStatus) -> GimbalAttitude:
-    """Return the attitude of MOUNT_STATUS; its yaw stays in the mount's frame (from north or from the nose)."""
+    """Return the attitude of MOUNT_STATUS. Its yaw, from north or from the nose, is not converted."""
     return GimbalAttitude(message.pointing_a / 100.0, message.pointing_b / 100.0, message.pointing_c / 100.0)
 
 

@@ -155,8 +155,8 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Frames are decoded at least at this interval (seconds), even if the program reads no value. A value that only earlier
-# frames contain, such as the last position before the fix was lost, is then at most this old.
+# Even if the program reads no value, a frame is decoded at this interval. Otherwise later frames would replace it, and
+# after a loss of the fix, the last position would be missing.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.

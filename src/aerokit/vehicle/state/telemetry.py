@@ -250,7 +250,7 @@ class Telemetry(States):
             context.before = cell.latest
             value = decode(message, context)
             if value is not None:
-                # The message may be older than the value, but the value may combine several types of message.
+                # A message older than the value is not dropped, because the value may combine several message types.
                 cell.set(value, source)
 
         chosen_update = update_with_context if message_source.needs_context else update
@@ -309,8 +309,8 @@ class Telemetry(States):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
-        # A text gets the time of its processing. After a pause of the event loop, a text that explains a refusal may
-        # have arrived before the time of the command.
+        # A text gets the time of its processing. After a pause of the event loop, its time of arrival may be before the
+        # time of the command that the text is about.
         joins_id_0 = self.autopilot.has_status_text_id_0
         self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=joins_id_0), source)
 
