@@ -199,7 +199,7 @@ class Settings:
                     if self._reboots != reboots_before:
                         continue  # A part of the list is from before the reboot.
                     unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
-                    # Prefer the values in `_known`, because `_store` has also recorded the messages during the download.
+                    # Prefer the values in `_known`: `_store` has also recorded the messages during the download.
                     self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
                     self._is_complete = True
                     break
