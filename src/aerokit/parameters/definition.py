@@ -257,7 +257,7 @@ def _check_option(
     by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
-    # A text that names no option can only be a value of the custom type, whose values may be texts.
+    # A text that is not the name of an option is allowed only for the custom type.
     if not isinstance(value, str) or setting.wire_type == MavParamExtType.CUSTOM:
         wire_value = checked_setting(setting.name, value, setting.wire_type)
         for option in options:

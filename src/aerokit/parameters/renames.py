@@ -65,13 +65,13 @@ class Rename(Snapshot):
         return 1 / self.divisor
 
     def to_new(self, value: float) -> int | float:
-        """Convert the old name's value to the new name's, in decimal arithmetic: 29 cm/s are exactly 0.29 m/s."""
+        """Convert a value to the units of the new name. Decimal arithmetic makes 29 cm/s exactly 0.29 m/s."""
         if self.is_inverted:
             return _checks_to_skip(int(value)) if _is_mask(value) else value
         return value if self.divisor == 1 else _scaled(value, lambda decimal: decimal / self.divisor)
 
     def to_old(self, value: float) -> int | float:
-        """Convert the new name's value to the old name's; see `to_new`."""
+        """Convert a value to the units of the old name; see `to_new`."""
         if self.is_inverted:
             return _checks_to_make(int(value)) if _is_mask(value) else value
         return value if self.divisor == 1 else _scaled(value, lambda decimal: decimal * self.divisor)

@@ -22,7 +22,7 @@ __all__ = ["MeasurementEncoder"]
 
 NAN = math.nan
 UNKNOWN_VECTOR: Vector = (NAN, NAN, NAN)
-# The upper triangle of a 6x6 matrix, row by row: indexes of its diagonal elements, and the number of all its elements.
+# The upper triangle of a 6x6 covariance matrix, row by row: indexes of the variances, and the number of all elements.
 POSITION_DIAGONAL, ORIENTATION_DIAGONAL, TRIANGLE_SIZE = (0, 6, 11), (15, 18, 20), 21
 MAX_SECTORS, UNKNOWN_DISTANCE, UNKNOWN_OBSTACLE_ID = 72, 0xFFFF, 0xFFFF
 MAX_CENTIMETRES = 0xFFFE
@@ -397,8 +397,8 @@ def _triangle(linear_variance: float | None, angular_variance: float | None) -> 
     triangle = [0.0] * TRIANGLE_SIZE
     for indexes, variance in ((POSITION_DIAGONAL, linear_variance), (ORIENTATION_DIAGONAL, angular_variance)):
         for index in indexes:
-            # An unknown variance is sent as 0, for which both autopilots use a minimum from their parameters. ArduPilot
-            # does not accept NaN here.
+            # An unknown angular variance is sent as 0, for which both autopilots use the minimum in their parameters.
+            # ArduPilot does not accept NaN here.
             triangle[index] = variance or 0.0
     if linear_variance is None:
         # NaN in the first element means that the linear variance is unknown.

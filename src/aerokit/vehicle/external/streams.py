@@ -28,8 +28,7 @@ __all__ = ["EstimatorUse", "MeasurementStream", "MeasurementT"]
 MeasurementT = TypeVar("MeasurementT")
 EstimatorUse: TypeAlias = Literal["used", "not used", "unknown"]
 
-# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS that is set while the estimator does not know the position, and assumes
-# a constant one.
+# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator does not know the position and assumes a constant one.
 CONSTANT_POSITION = 1 << 7
 # A report of the estimator that is older than this many seconds does not show its present state.
 ESTIMATOR_MAX_AGE_S = 2.5

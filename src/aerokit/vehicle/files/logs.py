@@ -40,8 +40,8 @@ MAX_UNANSWERED_REQUESTS = 4
 MAX_LOG_ID = 0xFFFF
 ERASE_RETRY_INTERVAL_S = 1.0
 ERASE_TIMEOUT_S = 60.0
-# The time of a log that is being written comes from the vehicle's clock, the time of a finished log from its file. For
-# the same log, these times may differ by this much.
+# While a log is being written, its time is that of the vehicle's clock, and later that of its file. The two times may
+# differ by this much.
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
 PX4_LIST = "logdata.txt"

@@ -242,7 +242,7 @@ class GimbalControl:
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
-        # The vehicle's block may end before the confirmation.
+        # Registered before the request, because the vehicle's block may end before the confirmation.
         self._detach_callbacks.append(orders.context.on_finish(self._finish))
         since = self._session.connection.now()
         try:

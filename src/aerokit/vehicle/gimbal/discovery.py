@@ -43,7 +43,7 @@ class GimbalRegistry:
         self._context, self._session = context, context.session
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
         # Represents the first gimbal until one is discovered, and receives the values of the first gimbal afterwards.
-        # MOUNT_STATUS, which has no gimbal id, sets only the values of this placeholder.
+        # MOUNT_STATUS and MOUNT_ORIENTATION, which have no gimbal id, set only the values of this placeholder.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
         # Requests of this program's `gimbal.control()` blocks that have not ended.

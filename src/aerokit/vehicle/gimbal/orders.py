@@ -68,7 +68,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        # Until a gimbal reports its attitude, the placeholder has it.
+        # Until a gimbal reports its attitude, only the placeholder may have one, from an older mount message.
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 

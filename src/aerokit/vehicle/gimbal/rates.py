@@ -69,7 +69,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._order: Order | None = None
         # The error that describes the loss of control; None until control is lost.
         self._taken: AerokitError | None = None
-        # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another gimbal.
+        # Until it is closed, the gimbal is in use, so that ``vehicle.gimbal`` does not change to another gimbal.
         self._cleanup = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
