@@ -178,7 +178,7 @@ def read_header(data: bytes) -> PackHeader:
 def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | None:
     """Decode the entry at ``position``. Return None if the data ends inside the entry.
 
-    ``previous_name`` is the name in the entry before, empty for the first entry. Raises RemoteProtocolError if the
+    ``previous_name`` is the name in the previous entry, empty for the first entry. Raises RemoteProtocolError if the
     data is not an entry.
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0

@@ -148,7 +148,7 @@ def diff(
     *,
     names: Iterable[str] | None = None,
 ) -> tuple[ParameterDifference, ...]:
-    """Compare parameters. Differences are in the order of ``before``; parameters that only ``after`` has come last.
+    """Compare parameters. Differences are in the order of ``before``; parameters missing in ``before`` come last.
 
     Numbers that are equal as 32-bit floats, or differ by at most ``tolerance``, count as the same. ``names`` restricts
     the comparison, and gives the order: ``diff(file, table, names=file)`` ignores parameters that the file does not

@@ -149,7 +149,7 @@ class Settings:
                 uri = (await self._request_information()).cam_definition_uri
             if not uri:
                 raise NotSupported(
-                    f"component {self._transfers.component_id} names no definition file: its settings can be read and"
+                    f"component {self._transfers.component_id} names no definition file; its settings can be read and"
                     " set without one"
                 )
             data = await fetch(uri, self._files_of, self._transfers.component_id, idle_timeout_s)

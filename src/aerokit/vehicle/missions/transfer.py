@@ -152,7 +152,8 @@ class PlanChannel:
         connection = self._context.transfers.connection
         if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
             raise NotSupported(
-                "MAVLink 1 can transfer only missions: the vehicle would use this plan as its mission; nothing was sent"
+                "MAVLink 1 can transfer only missions, so the vehicle would use this plan as its mission;"
+                " nothing was sent"
             )
         started_at = connection.now()
         try:

@@ -40,7 +40,7 @@ class RestoreRegistry:
         self._blocks.setdefault(name, []).append(block)
 
     def remove(self, name: str, block: _Block) -> _Block | None:
-        """Remove a block. Return the next block that wrote the parameter, or None after the last one."""
+        """Remove a block. Return the next block that wrote the parameter, or None."""
         blocks = self._blocks[name]
         position = blocks.index(block)
         del blocks[position]

@@ -71,7 +71,7 @@ EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
     """Request version, home, origin and modes while they are unknown.
 
-    Runs until the link closes, because a reboot makes all of them but the modes unknown.
+    Runs until the link closes, because a reboot makes version, home and origin unknown again.
     """
     mode_requests_left = MAX_MODE_REQUESTS
     await _learn_version(commands, telemetry)

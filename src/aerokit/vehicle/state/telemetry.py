@@ -232,7 +232,7 @@ class Telemetry(States):
         """Return the function that updates the cell of a state from one type of message."""
         cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
-        # A frame that was kept undecoded may be older than a value from a message of another type.
+        # A frame that was kept undecoded must not replace a newer value from a message of another type.
         may_be_older = message_source.message in LAZY and len(field.sources) > 1
 
         def update(message: Any, source: Source) -> None:
