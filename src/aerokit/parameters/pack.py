@@ -252,7 +252,7 @@ def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> byte
     common = _common_length(name, previous_name)
     _, value_format = _CODES[code]
     type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
-    # Four bits for the shared characters, and four for the number of own characters minus 1.
+    # Four bits for the number of shared characters, and four for the number of own characters minus 1.
     lengths = common | (len(name) - common - 1) << 4
     return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(value_format.pack, values))
 

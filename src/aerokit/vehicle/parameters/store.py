@@ -37,7 +37,7 @@ class ParameterStore:
         # this ends.
         self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
-        # The known parameters as a table; None until it is built again after a change.
+        # The known parameters as a table, built when it is needed; None after a change.
         self._table: ParameterTable | None = ParameterTable()
         # True once the whole list has arrived since the vehicle started.
         self.is_complete: bool = False
@@ -46,7 +46,7 @@ class ParameterStore:
         self._forgotten_at = 0  # value of `updates` after the last reboot
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
-        # Maps each name to the value of `updates` after the last message with this parameter.
+        # Maps each name to the value of `updates` at the last message with this parameter.
         self._last_updates: dict[str, int] = {}
         # Maps each written parameter to its previous value, and to the time until which messages with that value are
         # ignored.

@@ -103,7 +103,7 @@ class _Block:
             if later_block is None:
                 to_restore.append(saved)
             else:
-                # An overlapping block has written the parameter later, so it restores the value at its own end.
+                # An overlapping block has written the parameter later. That block restores the value when it ends.
                 later_block._saved[name] = saved
         return to_restore
 

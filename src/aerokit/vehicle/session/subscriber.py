@@ -63,7 +63,7 @@ class ComponentSubscriber:
         self._register_cell = register_cell
         self._at_close = at_close
         self._end = end
-        # The cell with the latest message of each type, and the function that releases the request for its rate.
+        # Map each message type to the cell with its latest message, and to the function that ends its rate request.
         self._cells: dict[type[Message], StateCell[Any]] = {}
         self._rate_releases: dict[type[Message], Detach] = {}
 
