@@ -244,8 +244,7 @@ class MessageRates:
         if reset_count != self._reset_count:
             # `request_again` was called meanwhile. The answer may be from before a reboot, so the stream stays due.
             return
-        # The vehicle has accepted or refused the rate, so the stream is no longer due. Another needed rate,
-        # `request_again` or `watch` makes it due again.
+        # The vehicle has accepted or refused the rate, so this rate is not due any more.
         stream.failures = 0
         if refusal is None:
             stream.mark_requested(self._connection.now(), hz)
