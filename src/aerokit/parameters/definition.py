@@ -149,7 +149,7 @@ class CameraDefinition(Snapshot):
         return tuple(dependency for dependency in unique_names if dependency != name)
 
     def excluded_by(self, name: str, values: Values) -> tuple[str, ...]:
-        """Return the selected options that exclude a setting now, as texts such as ``CAM_EXPMODE = Auto``."""
+        """Return the selected options that exclude a setting, for example ``("CAM_EXPMODE = Auto",)``."""
         return tuple(
             f"{setting.name} = {option.name}"
             for setting, option in self._selected(values)
@@ -257,7 +257,7 @@ def _check_option(
     by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
-    # A text that names no option can only be a value of the custom type, whose values may be texts.
+    # A text that is not the name of an option is allowed only for the custom type.
     if not isinstance(value, str) or setting.wire_type == MavParamExtType.CUSTOM:
         wire_value = checked_setting(setting.name, value, setting.wire_type)
         for option in options:
@@ -365,8 +365,7 @@ class _Reader:
     def __init__(self, root: Element) -> None:
         self._root = root
         nodes = list(root.iterfind("parameters/parameter"))
-        # If a setting is defined several times, the first definition is used. In reversed order, it overwrites the
-        # others.
+        # If a setting is defined several times, the first definition is used. It must therefore enter the dict last.
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:

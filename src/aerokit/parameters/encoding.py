@@ -54,7 +54,7 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
 def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
     """Decode the four bytes of ``param_value``.
 
-    Never raises. If a vehicle sends a fraction or NaN for an integer type, the result is this float.
+    Never raises. A fraction or NaN that a vehicle sends for an integer type is returned as a float.
     """
     if bytewise and type in _FORMATS:
         return int(_FORMATS[type].unpack_from(bits)[0])
@@ -74,7 +74,7 @@ def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | 
 
 
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
-    """Return the value in a message. The value of a received message is exact to the bit."""
+    """Return the value in a PARAM_VALUE, exact to the bit if the message was received."""
     type_ = ParameterType.from_wire(message.param_type)
     if not bytewise or not math.isnan(message.param_value):
         return from_wire(message.param_value, type_, bytewise)

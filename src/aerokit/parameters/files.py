@@ -68,7 +68,7 @@ class ParameterFile(Mapping[str, "int | float"]):
 
 
 def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | None = None) -> ParameterFile:
-    """Read a file of Mission Planner, MAVProxy or QGroundControl. Its first parameter shows which format it has.
+    """Read a parameter file of Mission Planner, MAVProxy or QGroundControl. The format is detected.
 
     If a QGroundControl file has several components, ``component_id`` selects one, by default the autopilot (1).
 
@@ -201,7 +201,7 @@ def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]
     if len(fields) != 5:
         raise error
     system_id, component_id, name, value, type_number = fields
-    # The numbers have at most three digits. int() refuses a text of thousands of digits, and not by a FileFormatError.
+    # The length is limited, because int() raises a plain ValueError for a text of thousands of digits.
     if not all(text.isascii() and text.isdigit() and len(text) < 9 for text in (system_id, component_id, type_number)):
         raise error
     kind = int(type_number)

@@ -131,7 +131,7 @@ class Metadata(Mapping[str, ParameterMetadata]):
         return tuple(name for name in names if name in self and self[name].reboot_required)
 
     def check(self, name: str, value: float) -> None:
-        """Raise :class:`InvalidArgument` for NaN, or if a value of a known parameter is not recommended."""
+        """Raise :class:`InvalidArgument` if the value is NaN, or if the metadata does not recommend it."""
         if math.isnan(value):
             raise InvalidArgument(f"{name} = {value!r} is not a number")
         problem = self[name].problem(value) if name in self else None

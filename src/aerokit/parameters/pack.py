@@ -157,8 +157,7 @@ def pack_for_download(
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
         # The last `unsplit_size` bytes of the entry must be in one block. For PX4, these are the value and its default.
-        # For ArduPilot (``whole_defaults=False``), they are the last number only. A value may be split if a default
-        # follows it (AP_Filesystem_Param.cpp).
+        # ArduPilot (``whole_defaults=False``) keeps only the last number whole (AP_Filesystem_Param.cpp).
         _, value_format = _CODES[code]
         unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
@@ -179,7 +178,7 @@ def read_header(data: bytes) -> PackHeader:
 def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | None:
     """Decode the entry at ``position``. Return None if the data ends inside the entry.
 
-    ``previous_name`` is the name in the entry before, empty for the first entry. Raises RemoteProtocolError if the
+    ``previous_name`` is the name in the previous entry, empty for the first entry. Raises RemoteProtocolError if the
     data is not an entry.
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
@@ -253,7 +252,7 @@ def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> byte
     common = _common_length(name, previous_name)
     _, value_format = _CODES[code]
     type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
-    # Four bits for the shared characters, and four for the number of own characters minus 1.
+    # Four bits for the number of shared characters, and four for the number of own characters minus 1.
     lengths = common | (len(name) - common - 1) << 4
     return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(value_format.pack, values))
 

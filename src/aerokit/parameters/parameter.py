@@ -117,9 +117,7 @@ def check_name(name: str) -> str:
 
 
 def checked_value(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
-    """Convert a value to the form in which a vehicle stores it in this type.
-
-    This is an int, the nearest 32-bit float (REAL32), or the float itself (REAL64).
+    """Convert a value to its type: an int, the nearest 32-bit float (REAL32), or a float (REAL64).
 
     Raises:
         InvalidArgument: the type cannot hold the value: NaN, infinity, 300 as an INT8, 1.5 as an integer.
@@ -232,9 +230,7 @@ def setting_bytes(value: SettingValue, type: int) -> bytes:  # noqa: A002
 
 
 def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noqa: A002
-    """Convert a value to the form in which a component stores it in this type.
-
-    The result is an int, a float (rounded to 32 bits for REAL32), a string or bytes.
+    """Convert a value to its type: an int, a float (rounded to 32 bits for REAL32), a string or bytes.
 
     Raises:
         InvalidArgument: the type cannot hold the value: 300 as a UINT8, 1.5 as an integer, a string for a number, a

@@ -36,8 +36,8 @@ class Rename(Snapshot):
 
     Old values are divided by ``divisor``: 100 for centimetres that became metres. ``is_inverted`` is True for
     ARMING_CHECK (checks to make, 1 for all) and ARMING_SKIPCHK (checks to skip). ``vehicles`` are the vehicle types
-    that have the parameter. ``other_new`` are further names in new units, ``other_old`` further names in old units.
-    ``since`` is the ArduPilot version that introduced the new name.
+    that have the parameter. ``other_new`` are further names with the units of ``new``, ``other_old`` with those of
+    ``old``. ``since`` is the ArduPilot version that introduced the new name.
     """
 
     old: str
@@ -65,20 +65,20 @@ class Rename(Snapshot):
         return 1 / self.divisor
 
     def to_new(self, value: float) -> int | float:
-        """Convert the old name's value to the new name's, in decimal arithmetic: 29 cm/s are exactly 0.29 m/s."""
+        """Convert a value to the units of the new name. Decimal arithmetic makes 29 cm/s exactly 0.29 m/s."""
         if self.is_inverted:
             return _checks_to_skip(int(value)) if _is_mask(value) else value
         return value if self.divisor == 1 else _scaled(value, lambda decimal: decimal / self.divisor)
 
     def to_old(self, value: float) -> int | float:
-        """Convert the new name's value to the old name's; see `to_new`."""
+        """Convert a value to the units of the old name; see `to_new`."""
         if self.is_inverted:
             return _checks_to_make(int(value)) if _is_mask(value) else value
         return value if self.divisor == 1 else _scaled(value, lambda decimal: decimal * self.divisor)
 
 
 class Renamed(Snapshot):
-    """A parameter that was requested under one name, and that the vehicle has under another name, ``name``."""
+    """A parameter that was ``requested`` by another name than its ``name`` on the vehicle."""
 
     requested: str
     name: str
@@ -88,7 +88,7 @@ class Renamed(Snapshot):
         """Convert a value from the program's to the vehicle's units.
 
         A value that is multiplied or divided is also rounded if ``type`` is an integer type. A value that the parameter
-        cannot have, such as NaN or a fraction of a bit mask, is not converted.
+        cannot have, such as NaN or a fraction of a bit mask, is returned unchanged.
         """
         converted = self._convert(value, self.requested)
         is_scaled = self._has_other_units and self.rename.divisor != 1 and math.isfinite(converted)
@@ -136,7 +136,7 @@ class Renamed(Snapshot):
 def find_rename(name: str, other: str = "") -> Rename | None:
     """Find a renamed parameter by any of its names; return None for parameters that were not renamed.
 
-    A few old names have several new names, one for each vehicle type: ``other`` selects one of these.
+    A few old names have a new name for each vehicle type. Pass one of the new names as ``other`` to select it.
     """
     return next((rename for rename in _by_name().get(name, ()) if not other or other in rename.names), None)
 
@@ -148,14 +148,14 @@ def other_names(name: str) -> tuple[str, ...]:
 
 
 def replacement_of(name: str) -> str:
-    """Return a text about what replaces a parameter that has no direct successor; empty if unknown."""
+    """Describe what replaces a parameter that has no one-to-one replacement; empty if unknown."""
     return REPLACED.get(name, "")
 
 
 def resolve_rename(name: str, known: Container[str]) -> Renamed | None:
     """Find the other name under which a vehicle has parameter ``name``. ``known`` are the names of its parameters.
 
-    Returns None if the vehicle has the parameter under ``name`` itself, or under no name.
+    Returns None if the vehicle has ``name`` itself, or has no such parameter.
     """
     if name in known:
         return None
@@ -174,9 +174,8 @@ def translate_values(
     """Convert the values of a file or table to the names and units that a vehicle uses.
 
     ``known`` are the names of the vehicle's parameters, and ``types`` their types, for rounding. A parameter that the
-    vehicle has under no name keeps its name and value. If ``values`` has a parameter under several names, the value
-    under the vehicle's name is used. If that name is missing, the last value is used. The second result lists the
-    converted parameters.
+    vehicle does not have keeps its name and value. If ``values`` contains several names of one parameter, the vehicle's
+    own name takes precedence, otherwise the last name. The second result lists the converted parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []
@@ -235,8 +234,8 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
             two_way.update(dict.fromkeys(rename.names, rename))
     for since, vehicles, divisor, pairs in OLDER:
         for old, new in _pairs(pairs):
-            # If the new name was renamed again later, both renames become one with several old names. The units changed
-            # only at the later rename, so its divisor applies to all of them.
+            # If the new name was renamed again later, both renames become one with several old names. Its divisor is
+            # that of the later rename, because the earlier one did not change the units.
             rename = two_way.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
             if old not in rename.names:
                 rename = rename.replace(other_old=(*rename.other_old, old))

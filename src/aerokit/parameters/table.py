@@ -30,7 +30,7 @@ class ParameterTable(Mapping[str, Parameter]):
         values: Mapping[str, int | float],
         types: Mapping[str, ParameterType] = MappingProxyType({}),
     ) -> ParameterTable:
-        """Create a table from values, which are kept as they are. Parameters without a type become REAL32."""
+        """Create a table from values, without converting them. Parameters without a type become REAL32."""
         return cls(
             Parameter(name, value, types.get(name, ParameterType.REAL32), None, index)
             for index, (name, value) in enumerate(values.items())
@@ -131,7 +131,7 @@ ParameterValues = Mapping[str, "int | float"] | Mapping[str, Parameter]
 
 
 class ParameterDifference(Snapshot):
-    """A parameter whose values differ. ``before`` or ``after`` is None if the parameter is missing there."""
+    """A parameter that differs between two tables. ``before`` or ``after`` is None if that table lacks it."""
 
     name: str
     before: int | float | None
@@ -148,7 +148,7 @@ def diff(
     *,
     names: Iterable[str] | None = None,
 ) -> tuple[ParameterDifference, ...]:
-    """Compare parameters. Differences are in the order of ``before``; parameters that only ``after`` has come last.
+    """Compare parameters. Differences are in the order of ``before``; parameters missing in ``before`` come last.
 
     Numbers that are equal as 32-bit floats, or differ by at most ``tolerance``, count as the same. ``names`` restricts
     the comparison, and gives the order: ``diff(file, table, names=file)`` ignores parameters that the file does not

@@ -817,7 +817,7 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
         return self.aio.estimator_use
 
     def send(self, measurement: MeasurementT) -> None:
-        """Send a measurement now, or at the end of the period if another measurement was already sent in it.
+        """Send a measurement: now, or when the period of the previous measurement ends.
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
@@ -886,7 +886,7 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT."""
+        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10 and RNGFND1_ORIENT to match."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -972,11 +972,12 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     """Control of a gimbal for the duration of its ``async with`` block (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
 
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
-    releases control, without waiting if the block exits by an error or cancellation. When another station takes
-    control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken unless your program
-    already knows of the loss, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
-    system and component id cannot be detected.
+    releases control, without waiting if the block exits by an error or cancellation.
+
+    When another station takes control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including
+    running ones, raise :class:`GimbalTaken`. If neither an order nor :meth:`until_lost` has told your program of the
+    loss, leaving the block raises GimbalTaken. Another station that uses your own system and component id cannot be
+    detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -1023,12 +1024,13 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
     """Turns a gimbal at the latest rates that the program supplies in the ``async with`` block.
 
     Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. From then on the latest rates are sent at
-    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block while the stream
-    runs, also by an error, orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself,
-    with a rate of zero, if no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or
-    the vehicle is silent. It stops without sending a rate of zero if another order to the gimbal is given, or if
-    control is lost. After a stop, ``set`` and leaving the block raise :class:`SetpointStreamStopped` or
-    :class:`GimbalTaken`.
+    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block, also by an
+    error, orders a rate of zero, so that the gimbal keeps its direction.
+
+    The stream stops earlier, with a rate of zero, if no new rates are set for ``valid_for_s``, the event loop is
+    blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a rate of zero if another order to the
+    gimbal is given, or if control is lost. After these stops, ``set`` and leaving the block raise
+    :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -2070,7 +2072,7 @@ class Shell(BlockTwin["AsyncShell"]):
     """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
 
     PX4 has one shell for each of its ports, and all stations on a port share the shell. aerokit sends each line once.
-    aerokit does not know what a shell command does, so its rules for orders do not apply to shell commands.
+    aerokit's rules for orders do not apply to shell commands, because aerokit does not know their effect.
     SERIAL_CONTROL has neither sequence numbers nor acknowledgements, so parts of the text may be lost.
 
     Entering raises:
@@ -2129,10 +2131,10 @@ class Transaction(TransactionTwin):
     written parameters, and the exception of the block propagates. :class:`aerokit.errors.RollbackFailed` names the
     parameters that could not be restored; aerokit does not try again when the link returns.
 
-    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the parameter.
-    Other tasks of your program may write at the same time: a transaction restores the values from before its own first
-    write. Blocks with the same parameter may be nested and may overlap; an outer block that fails also undoes an inner
-    block that succeeded.
+    A value that another station has changed meanwhile is not restored; a warning of logger "aerokit" names the
+    parameter. Other tasks of your program may write at the same time: a transaction restores the values from before
+    its own first write. Blocks that write the same parameter may be nested or overlap. An outer block that fails also
+    undoes an inner block that succeeded.
     """
 
     @property
@@ -2168,8 +2170,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters. For names that are not known yet, it raises the rate after half a second.
-    It restores the rate at the end.
+    while it reads more than five parameters, and restores the rate at the end. For unknown names, which the vehicle may
+    not have, it raises the rate after half a second.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -2195,11 +2197,11 @@ class Parameters(TwinOf["AsyncParameters"]):
         return self.aio.metadata
 
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
-        """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
+        """Load the documentation of the parameters from a file.
 
-        Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
-        Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
-        The metadata of PX4 contains the defaults.
+        This is ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``,
+        which also contains the defaults. Metadata does not restrict writes: a value outside the documented range is
+        set, and its result has a ``note``. Metadata also identifies changes that need a reboot.
 
         Raises:
             FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
@@ -2304,7 +2306,7 @@ class Parameters(TwinOf["AsyncParameters"]):
     ) -> dict[str, ParameterWrite]:
         """Set several parameters concurrently; return a result for each of them. Check the ``error`` of each result.
 
-        A parameter that appears only after another one was set (ArduPilot's ``…_ENABLE``) is set after the other one.
+        Parameters that ArduPilot has only while an ``…_ENABLE`` parameter is set may be set together with it.
 
         Raises:
             InvalidArgument: a name or value is invalid. Nothing was set.
@@ -2361,9 +2363,10 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
         They are also restored if the block raises or is cancelled; this takes at most three times ``idle_timeout_s``.
-        If one value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
-        overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
-        before the first block. If another station has changed a value meanwhile, that value stays, and a warning of
+        If one value cannot be set, all other values are restored and the error is raised.
+
+        Blocks that set the same parameter may be nested or overlap. When the last of them ends, the parameter gets its
+        value from before the first. A value that another station has changed meanwhile is not restored; a warning of
         logger "aerokit" names the parameter.
 
         Raises:
@@ -2548,9 +2551,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: send nothing if the vehicle already has this plan. If the vehicle supports it, send only the
-                items that differ. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only if
-                ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
+            only_changes: send nothing if the vehicle already has this plan, and if possible only the items that differ.
+                PX4's plan is compared by its checksum. ArduPilot's plan is read first if ``plan`` is similar to the
+                plan that was last transferred; if not, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2650,8 +2653,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Args:
             item: number of the item.
-            timeout: only for MISSION_SET_CURRENT. Seconds to wait until a running transfer has ended, and as many again
-                until MISSION_CURRENT confirms the item.
+            timeout: only for MISSION_SET_CURRENT: seconds for each of two steps, the end of a running transfer and the
+                confirmation by MISSION_CURRENT.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -2699,10 +2702,11 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait. If a pilot then changes to another mode than that of the
-        mission, the wait ends. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An
-        upload or a download shows whether the mission ends with a landing. Without them, or after another station has
-        replaced the mission, the mode after the completion shows whether the vehicle lands.
+        A :meth:`pause` by another task does not end the wait, but a pilot who then changes the mode does. Cancelling
+        this call does not stop the vehicle, and no command is sent when it fails.
+
+        aerokit knows from an upload or a download whether the mission ends with a landing. Otherwise, or after another
+        station has replaced the mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
         items and the mission id (PX4 1.15 and later). On a shared link, the vehicle's answer to the other station also
@@ -2756,9 +2760,9 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: send nothing if the vehicle already has this plan. If the vehicle supports it, send only the
-                items that differ. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only if
-                ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
+            only_changes: send nothing if the vehicle already has this plan, and if possible only the items that differ.
+                PX4's plan is compared by its checksum. ArduPilot's plan is read first if ``plan`` is similar to the
+                plan that was last transferred; if not, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2865,9 +2869,9 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: send nothing if the vehicle already has this plan. If the vehicle supports it, send only the
-                items that differ. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only if
-                ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
+            only_changes: send nothing if the vehicle already has this plan, and if possible only the items that differ.
+                PX4's plan is compared by its checksum. ArduPilot's plan is read first if ``plan`` is similar to the
+                plan that was last transferred; if not, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2984,7 +2988,7 @@ class Rtk(TwinOf["AsyncRtk"]):
 
     @cached_property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent; their ``age`` counts from the last one sent."""
+        """Number, bytes and bandwidth of the corrections sent; ``age`` is the time since the last transmission."""
         return StateCell(self._loop, self.aio.corrections)
 
     def send(self, rtcm: bytes) -> None:
@@ -3510,15 +3514,16 @@ class Settings(TwinOf["AsyncSettings"]):
         *,
         locale: str | None = None,
     ) -> CameraDefinition:
-        """Use a camera definition, or read it from a file (``.xml`` or ``.xml.xz``).
+        """Set the camera definition that describes the settings.
 
         Args:
-            definition: result of :func:`aerokit.parameters.parse_definition`, or the path of a file.
-            locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
+            definition: the definition, or the path of its file (``.xml`` or ``.xml.xz``).
+            locale: language of descriptions and option names, such as ``"de"`` or ``"de_DE"``. Texts without a
+                translation are unchanged.
 
         Raises:
-            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition stays.
-            OSError: the file cannot be read.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition is kept.
+            OSError: the file cannot be read. The previous definition is kept.
         """
         return self._loop.call(self.aio.load, definition, locale=locale)
 
@@ -3556,14 +3561,14 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known values of other settings allow, as {name: value}.
+        """Return the present options of a setting as {name: value}; empty without a definition or without options.
 
-        Empty without a definition, and for settings without options.
+        The known values of other settings may exclude some options.
         """
         return self._loop.call(self.aio.options, name)
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """Return the settings that make a setting ineffective now, e.g. ``("CAM_EXPMODE = Auto",)``."""
+        """Return the selected options that exclude a setting, for example ``("CAM_EXPMODE = Auto",)``."""
         return self._loop.call(self.aio.excluded_by, name)
 
     def download(
@@ -4105,9 +4110,9 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
             NotSupported: the vehicle runs ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
-            CommandRejected: SYS_FAILURE_EN is 0, or PX4 can let this part fail, but not in this way.
-            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot let this part fail in any way. If
-                an acknowledgement was lost, the part may have failed.
+            CommandRejected: SYS_FAILURE_EN is 0, or PX4 does not support this kind of failure of the part.
+            CommandTimeout: there was no acknowledgement. PX4 sends none if it supports no failure of the part. If an
+                acknowledgement was lost, the part may have failed.
         """
         self._loop.run(self.aio.inject_failure, unit, kind, instance=instance, intent=intent)
 

@@ -276,8 +276,8 @@ class Component(ReadOnly):
                     except CommandRejected as error:
                         # If the refusal may belong to an earlier request, it counts only after the last attempt.
                         refusal = None if is_doubtful and attempts_left else error
-                    # After the last request, wait until the time-out. After a refusal, return the message if it has
-                    # already arrived, but do not wait for it.
+                    # After a refusal, return only a message that has arrived already. After the last request, wait
+                    # until the time-out.
                     limit_s = ATTEMPT_TIMEOUT_S if attempts_left else math.inf
                     with anyio.move_on_after(limit_s if refusal is None else 0):
                         async for answer in answers:
@@ -358,7 +358,7 @@ async def _read_json(component: Component, uri: str) -> dict[str, Any]:
         raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
     try:
         data = decompress(await component.fetch(uri), uri)
-    except InvalidArgument as error:  # The component has given this address, not the caller.
+    except InvalidArgument as error:  # The address is the component's, so this is no error of the caller.
         raise NotSupported(f"component {component.component_id}: {error}") from None
     try:
         content = json.loads(data.decode("utf-8-sig"))

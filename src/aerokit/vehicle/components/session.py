@@ -140,7 +140,7 @@ class _WebDownload:
     def __init__(self, uri: str, idle_timeout_s: float) -> None:
         self._uri = uri
         self._idle_timeout_s = min(idle_timeout_s, WEB_TIMEOUT_S)
-        # Shared with the thread: its connections, which `_abort` closes, and the flag that ends it.
+        # `_abort` closes the connections of the download thread, and sets the flag that ends the thread.
         self._connections: list[HTTPConnection] = []
         self._is_aborted = False
 

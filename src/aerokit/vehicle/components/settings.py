@@ -97,15 +97,16 @@ class Settings:
     def load(
         self, definition: CameraDefinition | str | os.PathLike[str], *, locale: str | None = None
     ) -> CameraDefinition:
-        """Use a camera definition, or read it from a file (``.xml`` or ``.xml.xz``).
+        """Set the camera definition that describes the settings.
 
         Args:
-            definition: result of :func:`aerokit.parameters.parse_definition`, or the path of a file.
-            locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
+            definition: the definition, or the path of its file (``.xml`` or ``.xml.xz``).
+            locale: language of descriptions and option names, such as ``"de"`` or ``"de_DE"``. Texts without a
+                translation are unchanged.
 
         Raises:
-            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition stays.
-            OSError: the file cannot be read.
+            FileFormatError: as for :func:`aerokit.parameters.load_definition`. The previous definition is kept.
+            OSError: the file cannot be read. The previous definition is kept.
         """
         from aerokit.parameters import load_definition
 
@@ -149,16 +150,16 @@ class Settings:
                 uri = (await self._request_information()).cam_definition_uri
             if not uri:
                 raise NotSupported(
-                    f"component {self._transfers.component_id} names no definition file: its settings can be read and"
+                    f"component {self._transfers.component_id} names no definition file; its settings can be read and"
                     " set without one"
                 )
             data = await fetch(uri, self._files_of, self._transfers.component_id, idle_timeout_s)
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known values of other settings allow, as {name: value}.
+        """Return the present options of a setting as {name: value}; empty without a definition or without options.
 
-        Empty without a definition, and for settings without options.
+        The known values of other settings may exclude some options.
         """
         if self._definition is None:
             return MappingProxyType({})
@@ -166,7 +167,7 @@ class Settings:
         return MappingProxyType({option.name: option.value for option in options})
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """Return the settings that make a setting ineffective now, e.g. ``("CAM_EXPMODE = Auto",)``."""
+        """Return the selected options that exclude a setting, for example ``("CAM_EXPMODE = Auto",)``."""
         return () if self._definition is None else self._definition.excluded_by(name, self._values())
 
     async def download(
@@ -199,7 +200,7 @@ class Settings:
                     if self._reboots != reboots_before:
                         continue  # A part of the list is from before the reboot.
                     unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
-                    # Values in `_known` are newer than those in the list, because `_store` has recorded every message.
+                    # Prefer the values in `_known`: `_store` has also recorded the messages during the download.
                     self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
                     self._is_complete = True
                     break

@@ -155,9 +155,9 @@ class DeviceActions(VehicleBase):
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
             NotSupported: the vehicle runs ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
-            CommandRejected: SYS_FAILURE_EN is 0, or PX4 can let this part fail, but not in this way.
-            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot let this part fail in any way. If
-                an acknowledgement was lost, the part may have failed.
+            CommandRejected: SYS_FAILURE_EN is 0, or PX4 does not support this kind of failure of the part.
+            CommandTimeout: there was no acknowledgement. PX4 sends none if it supports no failure of the part. If an
+                acknowledgement was lost, the part may have failed.
         """
         # The decorator `checks_arguments` has refused every other intent.
         await INJECT_FAILURE.send(self._context, UNITS[unit], FailureType[kind.upper()], instance)

@@ -177,7 +177,7 @@ class Actuators(ReadOnly):
         LANDING_GEAR.check_supported(self._context)
         telemetry = self._context.session.telemetry
         # An old report is sufficient, because a vehicle on the ground stands on its gear until it reports a take-off.
-        # Without a report, the order is sent, because the program decides.
+        # A vehicle that reports nothing gets the order.
         if telemetry.landed_state.latest == MavLandedState.ON_GROUND or telemetry.is_confirmed_disarmed:
             raise OperationRejected("raise_landing_gear: the vehicle is disarmed or on the ground; nothing was sent")
         await LANDING_GEAR.send(self._context, GEAR_UP, topic="landing gear")

@@ -32,7 +32,7 @@ class Shell(ReadOnly):
     """PX4's system shell, open for the duration of an ``async with`` block: ``vehicle.shell()`` (SERIAL_CONTROL).
 
     PX4 has one shell for each of its ports, and all stations on a port share the shell. aerokit sends each line once.
-    aerokit does not know what a shell command does, so its rules for orders do not apply to shell commands.
+    aerokit's rules for orders do not apply to shell commands, because aerokit does not know their effect.
     SERIAL_CONTROL has neither sequence numbers nor acknowledgements, so parts of the text may be lost.
 
     Entering raises:

@@ -22,7 +22,7 @@ __all__ = ["MeasurementEncoder"]
 
 NAN = math.nan
 UNKNOWN_VECTOR: Vector = (NAN, NAN, NAN)
-# The upper triangle of a 6x6 matrix, row by row: indexes of its diagonal elements, and the number of all its elements.
+# The upper triangle of a 6x6 covariance matrix, row by row: indexes of the variances, and the number of all elements.
 POSITION_DIAGONAL, ORIENTATION_DIAGONAL, TRIANGLE_SIZE = (0, 6, 11), (15, 18, 20), 21
 MAX_SECTORS, UNKNOWN_DISTANCE, UNKNOWN_OBSTACLE_ID = 72, 0xFFFF, 0xFFFF
 MAX_CENTIMETRES = 0xFFFE
@@ -44,8 +44,8 @@ FLU_TO_FRD: Quaternion = (0.0, 1.0, 0.0, 0.0)
 class MeasurementEncoder:
     """Encodes measurements for one vehicle: each method returns the messages of one measurement.
 
-    A measurement that is out of range raises InvalidArgument. Time stamps are on the event loop's clock. PX4 converts
-    them to its own clock by the answers of `TimesyncAnswers`.
+    A measurement that is out of range raises InvalidArgument. Time stamps are on the event loop's clock, with which PX4
+    synchronizes by TIMESYNC.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -397,8 +397,8 @@ def _triangle(linear_variance: float | None, angular_variance: float | None) -> 
     triangle = [0.0] * TRIANGLE_SIZE
     for indexes, variance in ((POSITION_DIAGONAL, linear_variance), (ORIENTATION_DIAGONAL, angular_variance)):
         for index in indexes:
-            # For an angular variance of 0, both autopilots use the minimum in their parameters. ArduPilot does not
-            # accept NaN there.
+            # An unknown angular variance is sent as 0, for which both autopilots use the minimum in their parameters.
+            # ArduPilot does not accept NaN here.
             triangle[index] = variance or 0.0
     if linear_variance is None:
         # NaN in the first element means that the linear variance is unknown.

@@ -158,7 +158,7 @@ class TargetLanding:
 
         def is_down() -> bool:
             height = height_above_home(self._session.telemetry)
-            if height is not None:  # The climb above the lowest height so far shows a retry or a search.
+            if height is not None:  # A climb shows that the vehicle retries the landing or searches for the target.
                 self._lowest_m = min(self._lowest_m, height)
                 self._climbed_m = max(self._climbed_m, height - self._lowest_m)
             self._raise_if_source_failed()

@@ -28,8 +28,7 @@ __all__ = ["EstimatorUse", "MeasurementStream", "MeasurementT"]
 MeasurementT = TypeVar("MeasurementT")
 EstimatorUse: TypeAlias = Literal["used", "not used", "unknown"]
 
-# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS that is set while the estimator does not know the position, and assumes
-# a constant one.
+# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator does not know the position and assumes a constant one.
 CONSTANT_POSITION = 1 << 7
 # A report of the estimator that is older than this many seconds does not show its present state.
 ESTIMATOR_MAX_AGE_S = 2.5
@@ -159,7 +158,7 @@ class MeasurementStream(Generic[MeasurementT]):
         assumes_constant = health.flags & CONSTANT_POSITION and not is_flag_expected
         if assumes_constant or not has_position:
             return "not used"
-        # The first parameter selects the source of the position; the vehicle need not have the others.
+        # The first parameter selects the source of the position and must exist. The others may be missing.
         selecting_parameter, _ = rule.sole_source[0]
         is_sole_source = selecting_parameter in self._parameters and all(
             self._parameters[name] in allowed for name, allowed in rule.sole_source if name in self._parameters
@@ -167,7 +166,7 @@ class MeasurementStream(Generic[MeasurementT]):
         return "used" if is_sole_source else "unknown"
 
     def send(self, measurement: MeasurementT) -> None:
-        """Send a measurement now, or at the end of the period if another measurement was already sent in it.
+        """Send a measurement: now, or when the period of the previous measurement ends.
 
         Raises:
             InvalidArgument: a value is out of range; nothing was sent.
@@ -207,8 +206,8 @@ class MeasurementStream(Generic[MeasurementT]):
         if age_s > self._valid_for_s or session.watch.is_silent or not session.connection.is_open:
             self._dropped += 1
             return
-        # The next period begins when this one ends, even if this transmission is late, so that the average rate is
-        # right. After a longer pause, the next period is counted from now.
+        # A late transmission does not delay the following periods, so that the average rate is kept. After a pause of
+        # more than a period, the periods start again from now.
         next_period_at = self._next_at + self._period_s
         self._next_at = next_period_at if next_period_at > now else now + self._period_s
         for message in messages:

@@ -128,7 +128,7 @@ class ObstacleSectors(Snapshot):
 class ObstaclePoints(Snapshot):
     """Positions of obstacles in metres forward, right and down of the vehicle (OBSTACLE_DISTANCE_3D).
 
-    Each point is one message. Without points nothing is sent, and the vehicle keeps the obstacles that it knows.
+    Each point is sent as one message. If there are no points, nothing is sent, and the vehicle keeps its obstacles.
     """
 
     points_m: tuple[Vector, ...]
@@ -167,7 +167,7 @@ class TargetMeasurement(Snapshot):
     def from_angles(
         cls, forward_deg: float, right_deg: float, height_m: float, *, is_level: bool = False
     ) -> TargetMeasurement:
-        """Return a target that is ``height_m`` below a camera and appears at these angles from straight down."""
+        """Return a target ``height_m`` below a camera that sees it at these angles from straight down."""
         forward, right = (math.tan(math.radians(angle)) * height_m for angle in (forward_deg, right_deg))
         return cls(forward, right, height_m, is_level)
 
@@ -181,9 +181,9 @@ class FlowMeasurement(Snapshot):
     """Optical flow of a camera that looks down (OPTICAL_FLOW, OPTICAL_FLOW_RAD).
 
     ``x_rad`` and ``y_rad`` are the movement of the picture within ``interval_s``, as angles about the body's forward
-    and right axes. For a camera that only turns, they are the angles of its turn. ``gyro_rad`` has the angles by which
-    the body really turned, about all three axes; do not subtract them from ``x_rad`` and ``y_rad``. ``quality`` is from
-    0 to 255. Send every measurement without gaps: ArduPilot uses the time between two messages as ``interval_s``.
+    and right axes. They include the rotation of the body: do not subtract ``gyro_rad``, which is this rotation about
+    all three axes. ``quality`` is from 0 to 255. Send every measurement without gaps: ArduPilot uses the time between
+    two messages as ``interval_s``.
     """
 
     x_rad: float

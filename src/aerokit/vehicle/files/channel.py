@@ -69,7 +69,8 @@ class FileChannel:
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
-        # Sessions that are being closed in the background, by their ids: the request, and the task that repeats it.
+        # Maps the id of each session that is being closed in the background to the request that closes it, and to the
+        # task that sends this request.
         self._closing: dict[int, tuple[FtpRequest, asyncio.Task[None]]] = {}
 
     @asynccontextmanager
@@ -81,9 +82,10 @@ class FileChannel:
         idle_timeout_s: float,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Run one operation in a block, after the previous operations have ended.
+        """Wait until earlier operations have ended, then run the block as the next operation.
 
-        Raises FileTimeout after ``timeout`` seconds, with the ranges that ``missing()`` returns.
+        Raises FileTimeout if this takes more than ``timeout`` seconds. ``missing()`` returns the byte ranges that have
+        not arrived, for the error.
         """
         with _limit(description, timeout, missing):
             async with self._lock:
@@ -161,9 +163,8 @@ class FileChannel:
                 reply = await self.transfers.run(request)
             except FileError as error:
                 if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
-                    # The file was requested more than once. An earlier request may have opened the session that is now
-                    # in use, if its reply was lost. Close this session. PX4 has only one, which may also belong to
-                    # another station. That station must then open its file again.
+                    # If the reply to an earlier request was lost, this program may already have a session. Close it.
+                    # PX4 has only one session: if it belongs to another station, that station must open its file again.
                     may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
@@ -196,7 +197,7 @@ class FileChannel:
         )
 
     def _possible_sessions(self, request: FtpRequest) -> tuple[int, ...]:
-        """Return the ids that the session of an unanswered request may have."""
+        """Return the ids of the sessions that an unanswered request may have opened."""
         return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
@@ -235,7 +236,7 @@ class LogChannel:
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._lock = asyncio.Lock()
-        # Task that waits until the vehicle confirms the end of the last failed operation; None if none has failed.
+        # Task that repeats LOG_REQUEST_END after a failed operation; None if no operation has failed.
         self._ending: asyncio.Task[None] | None = None
 
     async def list(
@@ -285,9 +286,9 @@ class LogChannel:
         timeout: float | None,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Run one operation in a block, after the previous one.
+        """Wait until earlier operations have ended, then run the block as the next operation.
 
-        Raises FileTimeout after ``timeout`` seconds, with the ranges that ``missing()`` returns.
+        Raises FileTimeout as :meth:`FileChannel.operation`.
         """
         with _limit(description, timeout, missing):
             async with self._lock:

@@ -337,7 +337,7 @@ class Files:
             await self._fetch(path, into, idle_timeout_s, timeout, on_progress)
 
     async def _has_same_crc(self, path: str, part: PartFile, idle_timeout_s: float, timeout: float | None) -> bool:
-        """Compare the CRC-32 of both files. Return True if the vehicle cannot compute it."""
+        """Return True if both files have the same CRC-32, or if the vehicle cannot compute it."""
         try:
             vehicle_crc = await self.crc32(path, idle_timeout_s=idle_timeout_s, timeout=timeout)
         except FileError as error:

@@ -40,8 +40,8 @@ MAX_UNANSWERED_REQUESTS = 4
 MAX_LOG_ID = 0xFFFF
 ERASE_RETRY_INTERVAL_S = 1.0
 ERASE_TIMEOUT_S = 60.0
-# The time of a log that is being written comes from the vehicle's clock, the time of a finished log from its file. For
-# the same log, these times may differ by this much.
+# While a log is being written, its time is that of the vehicle's clock, and later that of its file. The two times may
+# differ by this much.
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
 PX4_LIST = "logdata.txt"
@@ -248,10 +248,7 @@ class Logs:
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
-        """Return the path of a log for MAVFTP, and the entry of the log.
-
-        If the path is None, the caller must download the log by LOG_* messages.
-        """
+        """Return a log's path for MAVFTP (None: use LOG_* messages instead), and its entry."""
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
             path = await self._path(log, idle_timeout_s)
@@ -289,8 +286,8 @@ class Logs:
         With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
         """
         log_id = log if isinstance(log, int) else log.id
-        # For an id, the whole list is requested, because the log may not exist. ArduPilot answers the request for a
-        # single nonexistent log by a list of nonexistent logs that does not end until LOG_REQUEST_END.
+        # For an id, request the whole list, because the log may not exist. ArduPilot answers the request for a single
+        # nonexistent log by an endless list of nonexistent logs.
         only_id = None if isinstance(log, int) else log.id
         max_unanswered = MAX_UNANSWERED_REQUESTS if gives_up_early else None
         async with self._channel.operation(f"log {log_id}", timeout):
@@ -342,9 +339,9 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
 
 
 def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
-    """Return the entries of ``listed``, a newer list, whose logs are also in ``logs``."""
-    # Logs are compared by time and size, because a new log may get the id of an erased one. Only the newest log may
-    # have grown since, so it is found by its id.
+    """Return the entries of the newer list ``listed`` whose logs are also in ``logs``."""
+    # Logs are compared by time and size, because a new log may get the id of an erased one. The newest log may have
+    # grown since, so it is also found by its id.
     newest = logs[-1]
     kinds = {(entry.time_utc, entry.size) for entry in logs}
     return tuple(
@@ -403,7 +400,7 @@ async def log_path(
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             # When its logs are requested, PX4 writes a list file with one path for each log id.
             logs = await _read_list_file(files, directory, idle_timeout_s)
-            # Both sizes, in the list and in `log`, are from the time at which PX4 wrote the list.
+            # PX4 measured both sizes when it wrote the list, so a different size means a different log.
             has_same_size = log.id < len(logs) and logs[log.id].size == log.size
             return logs[log.id].path if has_same_size else None
     return None

@@ -153,11 +153,12 @@ class GimbalControl:
     """Control of a gimbal for the duration of its ``async with`` block (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
 
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
-    releases control, without waiting if the block exits by an error or cancellation. When another station takes
-    control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing. It raises GimbalTaken unless your program
-    already knows of the loss, by an earlier GimbalTaken or by :meth:`until_lost`. Another station that uses your own
-    system and component id cannot be detected.
+    releases control, without waiting if the block exits by an error or cancellation.
+
+    When another station takes control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including
+    running ones, raise :class:`GimbalTaken`. If neither an order nor :meth:`until_lost` has told your program of the
+    loss, leaving the block raises GimbalTaken. Another station that uses your own system and component id cannot be
+    detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -241,14 +242,14 @@ class GimbalControl:
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
-        # The vehicle's block may end before the confirmation.
+        # Registered before the request, because the vehicle's block may end before the confirmation.
         self._detach_callbacks.append(orders.context.on_finish(self._finish))
         since = self._session.connection.now()
         try:
             await self._request_control()
             await self._await_confirmation(since)
         except (CommandRejected, NotSupported, BusyError):
-            # Control was not obtained, but an earlier block may have left the release of its control to this block.
+            # Control was not obtained. If an earlier block has left its release to this block, the release is due now.
             self._end()
             if self._control_request.must_release:
                 release.send_soon()
@@ -305,7 +306,7 @@ class GimbalControl:
             orders.ask_in_background(GimbalManagerStatus.ID)
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device
-        # Another block may have been entered during the wait, or another gimbal may be the first one now.
+        # During the wait, another block may have been entered, or another gimbal may have become the first one.
         if self._is_primary in device.control_blocks:
             raise BusyError(f"{orders.name}: another block of this program already has control")
         self._device = device

@@ -136,8 +136,8 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# If a status has a lower time stamp than the newest one, it arrived late. If it is lower by this many milliseconds or
-# more, the manager has rebooted instead.
+# A status whose time stamp is lower than the newest one arrived late. If it is lower by this many milliseconds or more,
+# the manager has rebooted.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
@@ -162,8 +162,8 @@ class GimbalDevice:
     def __init__(self, context: VehicleContext, component_id: int, number: int) -> None:
         self.component_id: int = component_id
         self.number: int = number
-        # Component id of the manager: at first the component to which the gimbal is attached; None for other gimbals,
-        # whose manager is not known yet.
+        # Component id of the manager; None while it is unknown. A gimbal without its own component id is attached to
+        # its manager.
         self.manager_id: int | None = component_id if number else None
         self.flags: int = 0  # the latest GIMBAL_DEVICE_FLAGS
         self.failures: int = 0  # the latest GIMBAL_DEVICE_ERROR_FLAGS
@@ -186,7 +186,7 @@ class GimbalDevice:
         self.controllers: StateCell[GimbalControllers] = context.session.connection.new_cell(
             f"{name}.controllers", "GIMBAL_MANAGER_STATUS"
         )
-        # False if the program has named this gimbal, but no message from it was received.
+        # True once a message from this gimbal was received. The program may name it earlier.
         self.is_discovered = False
         self.pending_orders: int = 0  # number of calls that are waiting for the end of an order to this gimbal
         # Rank of the known manager, and time stamp of its newest status; see `update_manager` and `update_status`.
@@ -292,7 +292,7 @@ class ControlRequest:
     def leave_release_to(self, requests: Iterable[ControlRequest]) -> bool:
         """Let other blocks with the same control release it later. Return False if there are none."""
         shared = [request for request in requests if request is not self and request.is_released_with(self)]
-        # Releasing now would take the control from these blocks, so they release it when they end.
+        # Releasing now would take the control from these blocks. They must release it when they end.
         for request in shared:
             request.must_release = True
         return bool(shared)

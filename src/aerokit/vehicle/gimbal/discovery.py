@@ -32,7 +32,7 @@ UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
 HEADING_MAX_AGE_S = 5.0
 # A component counts as gone if it is silent for this many seconds while the autopilot is not.
 MAX_SILENCE_S = 10.0
-# Precedence of managers. A device that manages itself has at least RANK_INFORMATION.
+# Precedence of managers, by the message that shows that a component is one. The autopilot always has the highest rank.
 RANK_STATUS, RANK_INFORMATION, RANK_AUTOPILOT = 1, 2, 3
 
 
@@ -42,8 +42,8 @@ class GimbalRegistry:
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
-        # Stands for the first gimbal until one is discovered. Then it has the state values of the first gimbal.
-        # MOUNT_STATUS has no gimbal id, so it sets only the values of this placeholder.
+        # Represents the first gimbal until one is discovered, and receives the values of the first gimbal afterwards.
+        # MOUNT_STATUS and MOUNT_ORIENTATION, which have no gimbal id, set only the values of this placeholder.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
         # Requests of this program's `gimbal.control()` blocks that have not ended.
@@ -174,9 +174,9 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Record the sender as the manager of a gimbal, and return the gimbal.
+        """Return the gimbal if the sender of this message is its manager, otherwise None.
 
-        Returns None if another manager has a higher rank, or if the gimbal is unknown.
+        A sender that outranks the known manager becomes the manager.
         """
         frame = message.received_frame
         if frame is None:
@@ -191,7 +191,7 @@ class GimbalRegistry:
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
         else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
             device = self._device_of(message, device_id)
-            # The sender's status about one of its own gimbals counts like GIMBAL_MANAGER_INFORMATION.
+            # A status about the sender's own gimbal is as reliable as GIMBAL_MANAGER_INFORMATION.
             rank = max(rank, RANK_INFORMATION)
         if device is None:
             return None

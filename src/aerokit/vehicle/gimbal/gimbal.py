@@ -214,7 +214,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
             failure = error
         device = orders.device
         is_placeholder = device.component_id == 0
-        if failure is None or not is_placeholder:  # If no manager answered, only a discovered gimbal can be asked.
+        if failure is None or not is_placeholder:  # The address of the gimbal is known.
             has_own_id = not is_placeholder and device.number == 0
             target = device.component_id if has_own_id else manager_id
             try:

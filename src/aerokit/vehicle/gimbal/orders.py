@@ -43,7 +43,7 @@ STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Orders to ``device``. If it is None, each order goes to the gimbal that is then the first.
+    """Sends orders to ``device``, or to the first gimbal if ``device`` is None.
 
     A new order ends the wait for the previous one.
     """
@@ -68,7 +68,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        # Until a gimbal reports its attitude, the placeholder has it.
+        # Until a gimbal reports its attitude, only the placeholder may have one, from an older mount message.
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 

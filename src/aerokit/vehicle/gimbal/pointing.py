@@ -77,8 +77,8 @@ class AngleTarget:
 class RestTarget:
     """Target of an order: the gimbal stands still in its retracted or neutral position.
 
-    ``flag`` is the GIMBAL_DEVICE_FLAGS bit that reports this position. With ``accepts_ahead``, a gimbal that is level
-    and straight ahead also counts as being there, because it may not report the flag.
+    ``flag`` is the GIMBAL_DEVICE_FLAGS bit that reports this position. Some gimbals do not report it. With
+    ``accepts_ahead``, level and straight ahead is accepted as the position too.
     """
 
     def __init__(self, flag: int, *, accepts_ahead: bool) -> None:
@@ -102,7 +102,7 @@ class RestTarget:
 
     def _is_direction_known(self, device: GimbalDevice) -> bool:
         attitude, source = device.attitude.value, device.attitude.source
-        # MOUNT_STATUS has no yaw from the nose, so its pitch decides.
+        # MOUNT_STATUS has no yaw from the nose, so its pitch is sufficient.
         has_no_yaw = source is not None and source.message == "MOUNT_STATUS"
         return attitude.pitch_deg is not None and (attitude.yaw_from_nose_deg is not None or has_no_yaw)
 
@@ -385,10 +385,7 @@ class PointingMixin(GimbalMixin):
             await wait_until_reached(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
-        """Raise InvalidArgument for an angle beyond the limits.
-
-        ``yaw`` is from the nose. None accepts any yaw.
-        """
+        """Raise InvalidArgument for an angle beyond the limits. ``yaw`` is from the nose; None is not checked."""
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
             return  # The program has not requested the limits by `information()`.

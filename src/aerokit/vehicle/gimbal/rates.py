@@ -32,12 +32,13 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     """Turns a gimbal at the latest rates that the program supplies in the ``async with`` block.
 
     Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. From then on the latest rates are sent at
-    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block while the stream
-    runs, also by an error, orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself,
-    with a rate of zero, if no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or
-    the vehicle is silent. It stops without sending a rate of zero if another order to the gimbal is given, or if
-    control is lost. After a stop, ``set`` and leaving the block raise :class:`SetpointStreamStopped` or
-    :class:`GimbalTaken`.
+    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block, also by an
+    error, orders a rate of zero, so that the gimbal keeps its direction.
+
+    The stream stops earlier, with a rate of zero, if no new rates are set for ``valid_for_s``, the event loop is
+    blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a rate of zero if another order to the
+    gimbal is given, or if control is lost. After these stops, ``set`` and leaving the block raise
+    :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -68,7 +69,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._order: Order | None = None
         # The error that describes the loss of control; None until control is lost.
         self._taken: AerokitError | None = None
-        # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another gimbal.
+        # Until it is closed, the gimbal is in use, so that ``vehicle.gimbal`` does not change to another gimbal.
         self._cleanup = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
@@ -116,11 +117,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        """Stop the gimbal, unless the stream has stopped already.
-
-        If it has, for example because of a newer order or a loss of control, raise an error with the reason. Nothing is
-        raised if the program already got this error, or if another error leaves the block.
-        """
+        """Stop the gimbal. If the stream has already stopped, raise its error instead."""
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:
             self._stop(reason, hold=False)

@@ -121,7 +121,7 @@ class PlanContext:
     def version(self, mission_type: int) -> tuple[int, int]:
         """Return a value that changes whenever this program notices a change of the vehicle's plan."""
         cache = self.caches[mission_type]
-        # `changes` also counts the plans of other stations on a shared link. The plan's id is 0 except on PX4.
+        # `changes` also counts the plans of other stations on a shared link. Only PX4 has a plan id other than 0.
         return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
@@ -148,8 +148,8 @@ class PlanContext:
         frame, connection = ack.received_frame, self.session.connection
         is_from_autopilot = frame is not None and self.session.telemetry.accepts(frame)
         is_addressed = is_addressed_to(ack, connection.source_system, connection.source_component)
-        # The ack of another station arrives only on a shared link. That station may use the same ids as this program
-        # (255 and 190 by default), so an ack to these ids is ours only while this program transfers a plan.
+        # Another station on a shared link may use the same ids as this program (255 and 190 by default). An ack to
+        # these ids is therefore ours only while this program transfers a plan.
         is_ours = is_addressed and self.lock.locked()
         if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:
             return
@@ -172,8 +172,8 @@ class MissionTracker:
     """State values and events for mission progress. Items are numbered from 0, without home.
 
     If the mission of an ArduCopter ends with a landing, the vehicle disarms and reports its first item as current, but
-    never reports the mission as complete. PX4 reports completion until the next mission has started. It reports an
-    active mission even in its landing mode, and sends each MISSION_ITEM_REACHED ten times.
+    never reports the mission as complete. PX4 reports completion until the next mission has started. PX4 also reports
+    an active mission in its landing mode, and sends each MISSION_ITEM_REACHED ten times.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -198,7 +198,7 @@ class MissionTracker:
         self._last_item_current_at = -math.inf
         # True if the vehicle flies to the item in `reached` once more.
         self._is_approached_again = False
-        # True if the vehicle has flown the mission since the mission last ended.
+        # True once the vehicle has flown the mission, until the mission ends.
         self._was_active = False
         # A report of completion before this time may be about the previous flight.
         self._stale_until = -math.inf

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# Maps commands that land the vehicle at the end of a mission to the purpose of the mode in which it may then land.
+# Maps commands that land the vehicle at the end of a mission to the mode in which it may do so.
 LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: "return",
     MavCmd.NAV_LAND: "land",
@@ -42,8 +42,8 @@ LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
 # Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 
-# On a bad link, several MISSION_CURRENTs may be lost, so a later one is awaited before the mission counts as
-# interrupted. A vehicle may also send none.
+# On a bad link, several MISSION_CURRENTs may be lost. The mission counts as interrupted if the next one does not report
+# the end, or if none arrives within this many seconds.
 END_REPORT_TIMEOUT_S = 10.0
 
 # A return may end at a rally point, whose position is unknown here, so it counts as finished after this time.
@@ -53,11 +53,11 @@ RETURN_TIMEOUT_S = 300.0
 class MissionEndDetector:
     """Detects the end of a mission.
 
-    Usually, a mission has ended when the vehicle reports completion or, if it reports no mission state, when the last
-    item is reached. These missions end later:
+    The vehicle must report completion or, if it reports no mission state, must have reached the last item. Some
+    missions end later:
 
     - If the last item is a landing, or a return with a landing, the vehicle must also be on the ground, because PX4
-      reports completion when the return starts. If it disarms in the mode of this item, no report is needed.
+      reports completion when the return starts. A vehicle that disarms in the mode of this item needs no report.
     - If the last item is a return without a landing, the vehicle must be at home.
     - If the items are unknown, the mode after the completion shows whether the vehicle still lands.
 
@@ -80,7 +80,7 @@ class MissionEndDetector:
         self._is_last_item_landing_or_return = last_command in LANDING_PURPOSES
         self._ends_by_return_without_landing = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
-        # Modes in which the vehicle may land. If the last item is a landing or a return, only its mode counts.
+        # Modes in which the vehicle may land: only that of the last item if this is a landing or a return.
         self._landing_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for command, purpose in LANDING_PURPOSES.items()
@@ -96,7 +96,7 @@ class MissionEndDetector:
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
         # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
-        # On the ground, the mission has ended only if the vehicle has landed, and not fallen.
+        # On the ground, the mission has ended only if the vehicle has landed instead of fallen.
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
@@ -124,25 +124,22 @@ class MissionEndDetector:
             return completes_at_home or self._has_returned() or self._is_on_ground
         if self._ends_by_landing_or_return:
             return self._is_on_ground
-        # The last item is neither a landing nor a return. If the items are unknown, it may still be one of them.
+        # Known items do not end by a landing or a return here. Unknown items may, which the mode shows a little later.
         return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
-        """Return True if the mission has been complete for ``END_GRACE_S``.
-
-        Call this only while it is complete. The first call starts the time.
-        """
+        """Return True if the mission, which is complete now, has been complete for ``END_GRACE_S``."""
         now = self._session.connection.now()
         if self._completed_at is None:
             self._completed_at = now
-        # PX4 reports completion when a return or a landing begins. HEARTBEAT may report the new mode a little later.
+        # PX4 reports completion when a return or a landing begins, which HEARTBEAT may show a little later.
         return now - self._completed_at >= END_GRACE_S
 
     @property
     def _ends_by_landing_or_return(self) -> bool:
         if self._are_items_known:
             return self._is_last_item_landing_or_return
-        # The items are unknown, so the vehicle's mode after the completion shows the landing or the return.
+        # The items are unknown, but the vehicle's mode after the completion shows whether it lands.
         is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
 
@@ -168,8 +165,8 @@ class MissionEndDetector:
         if is_mode_expected and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
-        # The end of the mission also changes the mode. The vehicle may report the mode before the end, so wait for
-        # END_GRACE_S and for a MISSION_CURRENT before the mode counts as a failure.
+        # The mode also changes at the end of the mission, which may be reported a little later than the mode. Another
+        # mode is therefore a failure only after END_GRACE_S and a MISSION_CURRENT.
         if self._left_at is None:
             self._left_at = now
         has_report = self._tracker.progress.updated_at > self._left_at
@@ -200,10 +197,7 @@ class MissionEndDetector:
         return self._session.telemetry.mode.latest in self._landing_modes
 
     def _has_returned(self) -> bool:
-        """Return True if the vehicle is at home, or after ``RETURN_TIMEOUT_S``.
-
-        The first call starts this time.
-        """
+        """Return True if the vehicle is at home, or if the first call was more than ``RETURN_TIMEOUT_S`` ago."""
         session, now = self._session, self._session.connection.now()
         if self._return_began_at is None:
             self._return_began_at = now
@@ -266,8 +260,8 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Args:
             item: number of the item.
-            timeout: only for MISSION_SET_CURRENT. Seconds to wait until a running transfer has ended, and as many again
-                until MISSION_CURRENT confirms the item.
+            timeout: only for MISSION_SET_CURRENT: seconds for each of two steps, the end of a running transfer and the
+                confirmation by MISSION_CURRENT.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -365,10 +359,11 @@ class MissionControl(VehiclePlan["Mission"]):
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait. If a pilot then changes to another mode than that of the
-        mission, the wait ends. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An
-        upload or a download shows whether the mission ends with a landing. Without them, or after another station has
-        replaced the mission, the mode after the completion shows whether the vehicle lands.
+        A :meth:`pause` by another task does not end the wait, but a pilot who then changes the mode does. Cancelling
+        this call does not stop the vehicle, and no command is sent when it fails.
+
+        aerokit knows from an upload or a download whether the mission ends with a landing. Otherwise, or after another
+        station has replaced the mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
         items and the mission id (PX4 1.15 and later). On a shared link, the vehicle's answer to the other station also
@@ -446,14 +441,11 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item.
-
-        If ``keeps_jump_counts`` is False, setting item 0 also resets ArduPilot's jump counts.
-        """
+        """Set the current item."""
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
-            # ArduPilot also resets the jump counts if it gets the number 0, which is the number of home.
+            # The number 0 is home. ArduPilot then begins with the first item, and also resets its jump counts.
             number = 0 if item == 0 and not keeps_jump_counts else seq
             try:
                 await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)
@@ -507,7 +499,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         await self._order_mode(mode, order, timeout)
-        self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
+        self._tracker.discard_completion()  # Until now, the vehicle may have reported the end of the previous flight.
 
     async def _order_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle_context, session = self._vehicle_context, self._session
@@ -517,8 +509,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                # No refusals are watched here, because only PX4 refuses a command after it has accepted it, and PX4
-                # does not get MISSION_START.
+                # Only PX4 refuses commands after it has accepted them, and PX4 does not get MISSION_START.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )

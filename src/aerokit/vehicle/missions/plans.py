@@ -54,9 +54,9 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: send nothing if the vehicle already has this plan. If the vehicle supports it, send only the
-                items that differ. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only if
-                ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
+            only_changes: send nothing if the vehicle already has this plan, and if possible only the items that differ.
+                PX4's plan is compared by its checksum. ArduPilot's plan is read first if ``plan`` is similar to the
+                plan that was last transferred; if not, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position

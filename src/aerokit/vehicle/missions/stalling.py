@@ -33,10 +33,11 @@ _WAYPOINTS = (MavCmd.NAV_WAYPOINT, MavCmd.NAV_SPLINE_WAYPOINT)
 class MissionStallDetector:
     """Detects a fall, and a vehicle that does not move although its mission item requires movement.
 
-    A fall is a fast descent that is followed at once by 12 s of standstill. The vehicle must be on the ground, or at an
-    item that requires movement. Without a fast descent, a standstill of ``MISSION_STALL_TIMEOUT_S`` is reported at such
-    an item. Items count only in the mission mode, and are known only after an upload or a download. A paused or
-    disarmed vehicle is never reported.
+    A fall is a fast descent that is followed at once by 12 s of standstill. It is reported on the ground, and at an
+    item that requires movement. At such an item, a standstill of ``MISSION_STALL_TIMEOUT_S`` is reported even without
+    a descent. A paused or disarmed vehicle is never reported.
+
+    Items are known only after an upload or a download, and require movement only in the mission mode.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class MissionStallDetector:
             return None
         should_move = self._should_move(current)
         standstill = self._stall()  # None unless the vehicle has stood still for 12 s
-        # A standstill after a fast descent is a fall. In the air, this holds only at an item that requires movement.
+        # A standstill after a fast descent is a fall. In the air, the vehicle may instead hover at its current item.
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.

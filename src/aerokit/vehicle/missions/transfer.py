@@ -152,7 +152,8 @@ class PlanChannel:
         connection = self._context.transfers.connection
         if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
             raise NotSupported(
-                "MAVLink 1 can transfer only missions: the vehicle would use this plan as its mission; nothing was sent"
+                "MAVLink 1 can transfer only missions, so the vehicle would use this plan as its mission;"
+                " nothing was sent"
             )
         started_at = connection.now()
         try:
@@ -244,7 +245,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         items = plan.to_items()
-        if self._offset:  # Item 0 must be the vehicle's home, because older firmware may set its home to item 0.
+        if self._offset:  # Item 0 must be the vehicle's home, because older firmware may use it as the new home.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()
@@ -301,7 +302,7 @@ class PlanTransfer(Generic[PlanT]):
             if not has_ftp:
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
-        # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
+        # ArduPilot refuses a mission file while it flies a mission, because it would clear the old mission first.
         is_refused = is_upload and self._mission_type == MavMissionType.MISSION and self._context.is_flying_mission
         return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
 
@@ -316,7 +317,6 @@ class PlanTransfer(Generic[PlanT]):
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
-        # The items are read back to verify them, or if the vehicle's answers to the upload were ambiguous.
         if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
         received = await self._read(method)
@@ -325,8 +325,10 @@ class PlanTransfer(Generic[PlanT]):
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
+            # The answers to the upload were ambiguous. The differences show that the vehicle refused the plan.
             raise MissionRejected(
-                f"{self._name}: the vehicle refused the plan at about item {result.item}; its items differ",
+                f"{self._name}: the vehicle refused the plan at about item {result.item};"
+                " its items differ from those sent",
                 result=MavMissionResult.ERROR,
                 item=result.item,
                 reasons=error.differences,
@@ -354,7 +356,7 @@ class PlanTransfer(Generic[PlanT]):
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._mission_type, self._cache.updated_at)
             checksum = mission_checksum(items)
-            # Another station may have just replaced the plan, so the next report must have the same checksum.
+            # Another station may have just replaced the plan. The next report must therefore have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._mission_type, checksum):
                 self._cache.set(items, self._context.now(), checksum)
                 return True

@@ -42,17 +42,17 @@ DEFAULT_INTERVAL = 0
 ECHO_WINDOW_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
 MAX_READS_UNBOOSTED = 5
-# If reading a few parameters takes longer than this many seconds, the vehicle probably lacks one of them. ArduPilot's
-# rate of answers is then raised, so that the repeated requests for the missing one take less time.
+# Reading a few parameters raises ArduPilot's rate of answers after this many seconds. By then, the vehicle probably
+# lacks a parameter, whose request must be repeated.
 BOOST_DELAY_S = 0.5
-# Fewer changes than this are set one by one, which is as fast as a file. The vehicle then confirms each value.
+# Fewer changes than this are set one by one. A file would not be faster, and the vehicle confirms each value.
 MIN_PACK_SIZE = 10
 # If more values than this must be read back, the whole list is downloaded instead.
 MAX_READ_BACK = 100
 
 
 class ParameterAccess:
-    """Access to the parameters of one vehicle by the names that the vehicle uses. Does not translate renamed ones."""
+    """Access to the parameters of one vehicle by the names in its firmware. Other names are not translated."""
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
@@ -260,10 +260,7 @@ class ParameterAccess:
 
     @contextmanager
     def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
-        """Raise the rate at which ArduPilot handles parameters during the block.
-
-        The rate is raised after ``after_s`` seconds, if the block lasts so long.
-        """
+        """Raise the rate at which ArduPilot handles parameters, from ``after_s`` seconds on until the block ends."""
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s == math.inf:
             yield
@@ -309,7 +306,7 @@ class ParameterAccess:
         known = [self.store.get(name) for name in names if not self.is_in_doubt(name)]
         old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
         self._forget_written(names)
-        # Recently written parameters are read back, so their answers take as long as those of reads.
+        # Recently written parameters are verified by a read, which ArduPilot answers more slowly than a write.
         recent = self._recently_written() & set(names)
         exchange = ParameterWrites(
             transfers.system_id,
@@ -360,7 +357,8 @@ class ParameterAccess:
             self.store.unmark_replaced(name)
 
     def _recently_written(self) -> set[str]:
-        # A late answer could be taken for the answer to the next write, so the next write is verified by a read.
+        # A late answer to the last write of these parameters could be taken for the answer to their next write. The
+        # next write is therefore verified by a read.
         earliest = self._transfers.connection.now() - ECHO_WINDOW_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
@@ -384,8 +382,8 @@ class ParameterAccess:
         if method == "set":
             return await self.write(parameters, idle_timeout_s, on_progress)
         answers: dict[str, ParameterAnswer] = {}
-        # A value that another task wrote during the read-back would differ from the file, count as not applied, and be
-        # overwritten.
+        # Another task must not write during the read-back. Its value would differ from the file, and this call would
+        # overwrite it.
         async with self._write_lock:
             self._forget_written(_names(parameters))
             try:

@@ -50,8 +50,8 @@ class Parameters(ReadOnly):
     no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters. For names that are not known yet, it raises the rate after half a second.
-    It restores the rate at the end.
+    while it reads more than five parameters, and restores the rate at the end. For unknown names, which the vehicle may
+    not have, it raises the rate after half a second.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -88,11 +88,11 @@ class Parameters(ReadOnly):
         return self._metadata
 
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
-        """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
+        """Load the documentation of the parameters from a file.
 
-        Metadata does not restrict writes: a value outside the documented range is set, and its result has a ``note``.
-        Only values that the type cannot represent are refused. Metadata also identifies changes that need a reboot.
-        The metadata of PX4 contains the defaults.
+        This is ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``,
+        which also contains the defaults. Metadata does not restrict writes: a value outside the documented range is
+        set, and its result has a ``note``. Metadata also identifies changes that need a reboot.
 
         Raises:
             FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
@@ -201,7 +201,7 @@ class Parameters(ReadOnly):
     ) -> dict[str, ParameterWrite]:
         """Set several parameters concurrently; return a result for each of them. Check the ``error`` of each result.
 
-        A parameter that appears only after another one was set (ArduPilot's ``…_ENABLE``) is set after the other one.
+        Parameters that ArduPilot has only while an ``…_ENABLE`` parameter is set may be set together with it.
 
         Raises:
             InvalidArgument: a name or value is invalid. Nothing was set.
@@ -252,9 +252,10 @@ class Parameters(ReadOnly):
         """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
         They are also restored if the block raises or is cancelled; this takes at most three times ``idle_timeout_s``.
-        If one value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
-        overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
-        before the first block. If another station has changed a value meanwhile, that value stays, and a warning of
+        If one value cannot be set, all other values are restored and the error is raised.
+
+        Blocks that set the same parameter may be nested or overlap. When the last of them ends, the parameter gets its
+        value from before the first. A value that another station has changed meanwhile is not restored; a warning of
         logger "aerokit" names the parameter.
 
         Raises:

@@ -36,7 +36,7 @@ class ParameterStore:
         # Called after a message that may be late, with the parameter's name and the time after which its values count.
         self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
-        # The known parameters as a table; None until it is built again after a change.
+        # The known parameters as a table, built when it is needed; None after a change.
         self._table: ParameterTable | None = ParameterTable()
         # True once the whole list has arrived since the vehicle started.
         self.is_complete: bool = False
@@ -45,9 +45,10 @@ class ParameterStore:
         self._forgotten_at = 0  # value of `updates` after the last reboot
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
-        # Maps each name to the value of `updates` after the last message with this parameter.
+        # Maps each name to the value of `updates` at the last message with this parameter.
         self._last_updates: dict[str, int] = {}
-        # Maps each written name to the previous value, and the time until which messages with this value are ignored.
+        # Maps each written parameter to its previous value, and to the time until which messages with that value are
+        # ignored.
         self._replaced: dict[str, tuple[int | float, float]] = {}
 
     @property
@@ -71,8 +72,8 @@ class ParameterStore:
     def mark_replaced(self, name: str, value: float) -> None:
         """Ignore messages with the old value for ``IN_FLIGHT_S`` seconds after a write."""
         # ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
-        # value. An answer with the old value may therefore arrive after the confirmation of the write. Another station
-        # may also have restored the old value, so ``on_discarded`` is called after each ignored message.
+        # value. An answer with the old value may therefore arrive after the confirmation of the write. But another
+        # station may also have restored the old value. `on_discarded` is therefore called for each ignored message.
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
     def unmark_replaced(self, name: str) -> None:

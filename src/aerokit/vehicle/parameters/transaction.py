@@ -40,7 +40,7 @@ class RestoreRegistry:
         self._blocks.setdefault(name, []).append(block)
 
     def remove(self, name: str, block: _Block) -> _Block | None:
-        """Remove a block. Return the next block that wrote the parameter, or None after the last one."""
+        """Remove a block. Return the next block that wrote the parameter, or None."""
         blocks = self._blocks[name]
         position = blocks.index(block)
         del blocks[position]
@@ -73,7 +73,7 @@ class _Block:
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
         unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
-        # The store may be outdated, so the vehicle's values are saved.
+        # Save the vehicle's present values, because the store may be outdated.
         answers = await self._access.read(unread_names, idle_timeout_s)
         if self._has_ended:  # A write by another task must not outlive the block, because nothing would restore it.
             raise InvalidArgument("the `async with` block has ended; the remaining parameters were not set")
@@ -81,9 +81,9 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # The answer may lack the last bits of a float, so the store's value is used if both are equal up to
-            # rounding. Otherwise the store is out of date: another station has just undone our write, and the store
-            # took the vehicle's message about this for a late one.
+            # If both values are equal up to rounding, use the stored one, because the answer may lack the last bits of
+            # a float. Otherwise the store is out of date: another station has just undone our write, and the store has
+            # ignored the message about this (`mark_replaced`).
             known = self._access.store.get(name) or answer
             current[name] = known if same_value(float(known.value), float(answer.value)) else answer
             if name not in self._saved:
@@ -103,7 +103,7 @@ class _Block:
             if later_block is None:
                 to_restore.append(saved)
             else:
-                # An overlapping block has written the parameter later, so it restores the value at its own end.
+                # An overlapping block has written the parameter later. That block restores the value when it ends.
                 later_block._saved[name] = saved
         return to_restore
 
@@ -196,10 +196,10 @@ class Transaction(_Block):
     written parameters, and the exception of the block propagates. :class:`aerokit.errors.RollbackFailed` names the
     parameters that could not be restored; aerokit does not try again when the link returns.
 
-    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names the parameter.
-    Other tasks of your program may write at the same time: a transaction restores the values from before its own first
-    write. Blocks with the same parameter may be nested and may overlap; an outer block that fails also undoes an inner
-    block that succeeded.
+    A value that another station has changed meanwhile is not restored; a warning of logger "aerokit" names the
+    parameter. Other tasks of your program may write at the same time: a transaction restores the values from before
+    its own first write. Blocks that write the same parameter may be nested or overlap. An outer block that fails also
+    undoes an inner block that succeeded.
     """
 
     def __init__(

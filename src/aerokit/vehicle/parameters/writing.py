@@ -242,7 +242,7 @@ Resolve = Callable[[Iterable[str], float], Awaitable[dict[str, ResolvedParameter
 
 
 class _PlannedWrite(Snapshot):
-    """One requested value; ``to_send`` has the vehicle's name for the parameter and the value in the vehicle's unit."""
+    """One value to write: ``requested`` in the program's unit, and ``to_send`` with the vehicle's name and unit."""
 
     resolved: ResolvedParameter
     requested: int | float
@@ -276,7 +276,7 @@ class ParameterWriter:
     ) -> dict[str, ParameterWrite]:
         """Write the values, and return a result for each.
 
-        With ``upload``, only changed values are sent, by this method. Otherwise, all values are sent by PARAM_SET.
+        ``upload`` is the method by which only changed values are sent. Without it, all values are sent by PARAM_SET.
         ``resolve`` is called instead of :meth:`NameResolver.resolve`.
         """
         resolve = resolve or self.names.resolve
@@ -318,10 +318,7 @@ class ParameterWriter:
         *,
         is_first: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
-        """Return the planned writes and the errors.
-
-        ``is_first`` is True in the first round of writes. An invalid value then raises InvalidArgument.
-        """
+        """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
         plans: list[_PlannedWrite] = []
         first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
         errors: dict[str, AerokitError] = {}

@@ -176,7 +176,7 @@ class NtripClient:
         self._send = send
         self._caster = caster
         self._timeout = timeout
-        # None: the caster's source table decides, and was not read yet.
+        # True if the vehicle's position is sent to the caster; None until the caster's source table has decided.
         self._sends_position = send_position
         self._name = f"NTRIP {caster!r}"
         # Ends the background task; `_ended` is set when the task has ended.
@@ -294,8 +294,8 @@ class NtripClient:
         finally:
             if position_task is not None:
                 position_task.cancel()
-                # If sending the position has failed, reading has failed, too. The reason comes from the reader, so the
-                # task's exception is ignored.
+                # Ignore the task's exception. If sending the position has failed, reading has failed too, which gives
+                # the reason.
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {message_count} messages")

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
-# An equal message that the program passes to another vehicle within this many seconds counts as the same message. A
-# base station repeats an equal message (1005, its position) after a second at the earliest.
+# If the program passes an equal message to another vehicle within this many seconds, it is not sent again. A base
+# station repeats its position (1005) after a second at the earliest.
 REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 
@@ -98,7 +98,7 @@ class Rtk:
 
     @property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent; their ``age`` counts from the last one sent."""
+        """Number, bytes and bandwidth of the corrections sent; ``age`` is the time since the last transmission."""
         return self._corrections
 
     def send(self, rtcm: bytes) -> None:
@@ -138,8 +138,8 @@ class Rtk:
     def _send(self, message: bytes) -> None:
         if self._session.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
-        # One transmission reaches all vehicles of the connection, so this sends nothing if the object of another
-        # vehicle has just sent the message.
+        # One transmission reaches all vehicles of the connection. If another vehicle's object has just sent the same
+        # message, `send_rtcm` does not send it again.
         send_rtcm(self._session.connection, message, self)
         now = self._session.connection.now()
         self._messages += 1

@@ -37,8 +37,10 @@ class CommandSender:
     """Runs the command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
     COMMAND_ACK has no request id. Commands with the same MAV_CMD to one component are therefore serialized; other
-    commands never wait for each other. When an order ends, aerokit aborts the order's running command and does not send
-    its waiting command. A late ack of a cancelled or unconfirmed command is not taken for the ack of the next command.
+    commands never wait for each other. A late ack of a cancelled or unconfirmed command is not taken for the ack of
+    the next command.
+
+    A command may belong to an order. If the order ends while its command runs or waits, the command is abandoned.
     """
 
     def __init__(
@@ -61,7 +63,7 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # Acks of earlier commands that may still arrive: the time at which each of them was recorded.
+        # Maps each command to the acks of earlier calls that may still arrive: the times at which they became pending.
         self._pending_acks: dict[_Key, list[float]] = {}
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
@@ -162,7 +164,6 @@ class CommandSender:
         return is_addressed_to(ack, self._connection.source_system, self._connection.source_component)
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
-        # The results of cancelled calls are recorded too.
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
     def is_unsupported(self, command: int, component_id: int | None = None) -> bool:
@@ -201,8 +202,8 @@ class CommandSender:
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_run_of_ended_order(key)
-        # If the order ends while this call waits for the lock, the command is not sent. An end before this call does
-        # not prevent the command, because the caller already knew of it.
+        # A caller may send a command for an order that has already ended. If the order ends later, while this call
+        # waits for the lock, the command is not sent.
         earlier_end = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:
@@ -214,9 +215,9 @@ class CommandSender:
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
-                # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command. If they arrived
-                # while this call waited for the lock, the command is repeated. This is harmless, because only commands
-                # that stop or release something are sent this way.
+                # The acks that `send_unconfirmed` has recorded as pending belong to this call. If they have arrived
+                # already, the command is repeated. This is harmless, because only commands that stop or release
+                # something are sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
@@ -242,7 +243,8 @@ class CommandSender:
                 raise
             finally:
                 del self._runs[key], self._order_statuses[key]
-                # Acks arrive in the order of their commands, so those received now belong to the oldest records.
+                # Acks arrive in the order of their commands. The acks received so far therefore belong to the oldest
+                # pending commands.
                 still_pending = pending_acks[exchange.answers :]
                 self._expect_acks(key, exchange.pending_answers, still_pending)
 
@@ -265,8 +267,8 @@ class CommandSender:
     def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
         """Record acks that may still arrive, so that the next command ignores them.
 
-        ``count`` is the number of acks that the last command may still get. ``earlier_records`` are the times that
-        :meth:`_pop_pending_acks` has returned, without those of the acks that have arrived since.
+        ``count`` is the number of acks that the last command may still get. ``earlier_records`` are those from
+        :meth:`_pop_pending_acks` whose acks have still not arrived.
         """
         new_records = [self._connection.now()] * count
         if earlier_records or new_records:

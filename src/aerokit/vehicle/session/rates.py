@@ -80,7 +80,7 @@ class _Stream:
 
     @property
     def needed_hz(self) -> float:
-        """The highest needed rate that was not refused. If there is none, 0: the autopilot's own rate."""
+        """The highest requested rate that the vehicle has not refused; ``AUTOPILOT_DEFAULT`` if there is none."""
         return max((hz for hz in self.requests.values() if hz not in self.refused_hz), default=AUTOPILOT_DEFAULT)
 
     @property
@@ -140,8 +140,7 @@ class MessageRates:
         """Request a message at ``hz`` or faster until the returned function is called.
 
         The rate is above 0 and at most 1000. ``is_optional`` means that the vehicle may lack the message, for example
-        because it lacks the sensor. If all requests for a message are optional, no event reports that it never
-        arrives.
+        because it lacks the sensor. A missing message is reported only if a request for it is not optional.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
@@ -236,8 +235,7 @@ class MessageRates:
                 return
             refusal = error
         except CommandTimeout:
-            # If `request_again` was called meanwhile, it has reset the number of failures, and this failure is not
-            # counted.
+            # A failure from before a call of `request_again` does not count.
             if reset_count == self._reset_count:
                 stream.failures += 1
                 interval_s = min(2**stream.failures, MAX_RETRY_INTERVAL_S)
@@ -246,8 +244,7 @@ class MessageRates:
         if reset_count != self._reset_count:
             # `request_again` was called meanwhile. The answer may be from before a reboot, so the stream stays due.
             return
-        # The vehicle has accepted or refused the rate. In both cases, it is not requested again until another rate is
-        # needed, or `request_again` or `watch` makes the stream due again.
+        # The vehicle has accepted or refused the rate, so this rate is not due any more.
         stream.failures = 0
         if refusal is None:
             stream.mark_requested(self._connection.now(), hz)
@@ -327,7 +324,7 @@ class MessageRates:
         if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
-        # If no message arrived in the first period of the window, the stream began later, so its average is too low.
+        # If no message arrived in the first period of the window, the stream began later. Its average is then too low.
         has_just_started = achieved_hz > 0 and stream.counts_at_checks[0] == stream.counts_at_checks[1]
         if has_just_started and not stream.is_slow:
             return

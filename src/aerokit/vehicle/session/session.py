@@ -64,14 +64,14 @@ RETRY_INTERVAL_S = 3.0
 # it may belong to an earlier request, because PX4 acknowledges a command over each of its ports.
 MAX_MODE_REQUESTS = 3
 
-# Number of requests for the version that are sent at short intervals at first, and the interval in seconds.
+# The first requests for the version are sent quickly: their number, and the interval in seconds.
 EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
     """Request version, home, origin and modes while they are unknown.
 
-    Runs until the link closes, because a reboot makes all of them but the modes unknown.
+    Runs until the link closes, because a reboot makes version, home and origin unknown again.
     """
     mode_requests_left = MAX_MODE_REQUESTS
     await _learn_version(commands, telemetry)
@@ -91,7 +91,7 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
 
 async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
     version = telemetry.version
-    # The first transfer waits for the capabilities in AUTOPILOT_VERSION, so it is requested at short intervals.
+    # AUTOPILOT_VERSION is requested at short intervals, because the first transfer waits for its capabilities.
     for _ in range(EAGER_REQUESTS):
         if version.is_known:
             return
@@ -191,8 +191,7 @@ class VehicleSession:
 
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         self.telemetry.receive(heartbeat)
-        # A message with a default rate may be missing. If a message that the program has named is missing, it is
-        # reported.
+        # A missing message is reported only if the program has named it.
         are_default = rates is None
         requested_rates = self.telemetry.default_rates if rates is None else rates
         for message_type, hz in requested_rates.items():
@@ -212,10 +211,7 @@ class VehicleSession:
         self.rates.close()
 
     def at_close(self, *functions: Detach) -> None:
-        """Register callbacks for the end of the vehicle's `async with` block.
-
-        After its end, they are called at once.
-        """
+        """Call these functions when the vehicle's `async with` block ends, or now if it has already ended."""
         self._detach_callbacks += functions
         if self.is_closed:
             for function in functions:
@@ -262,9 +258,9 @@ class VehicleSession:
                 release()
 
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
-        """Raise OperationRejected if the vehicle is not known to be disarmed.
+        """Raise OperationRejected unless the vehicle is known to be disarmed.
 
-        Pass ``is_current=False`` if the last HEARTBEAT is too old to show the present state.
+        Pass ``is_current=False`` if the last HEARTBEAT is too old; the call then always raises.
         """
         if not self.telemetry.is_confirmed_disarmed or not is_current:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
@@ -312,7 +308,7 @@ class VehicleSession:
 
     def with_reasons(self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()) -> CommandRejected:
         """Return the error with ``reasons`` and with the vehicle's status texts from ``since`` on."""
-        # Informational texts such as "ArduPilot Ready" are no reasons, but known refusals always are.
+        # Informational texts such as "ArduPilot Ready" are left out, unless they are known refusals.
         texts = [
             text.text
             for text in self.telemetry.texts_since(since)

@@ -62,8 +62,7 @@ def _check_vehicle(session: VehicleSession) -> None:
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, initial_timestamp=0)
-    # The vehicle counts its time stamps from this `timestamp` on. The time stamp is a second ahead of our clock, so
-    # that the vehicle's next frames are later than those already received. Frames that are not later would be
-    # refused as replayed.
+    # The vehicle's time stamps continue from this `timestamp`. It is a second ahead of our clock, because frames that
+    # are not later than those already received would be refused as replayed.
     timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
     return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)

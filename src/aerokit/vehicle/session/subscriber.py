@@ -63,7 +63,7 @@ class ComponentSubscriber:
         self._register_cell = register_cell
         self._at_close = at_close
         self._end = end
-        # The cell with the latest message of each type, and the function that releases the request for its rate.
+        # Map each message type to the cell with its latest message, and to the function that ends its rate request.
         self._cells: dict[type[Message], StateCell[Any]] = {}
         self._rate_releases: dict[type[Message], Detach] = {}
 
@@ -165,7 +165,7 @@ class ComponentSubscriber:
 class WatchedStream:
     """Requests the message of a state cell only while the program waits for the cell or iterates over its values.
 
-    ``request`` returns None if the message need not be requested now. This `Feed` of the cell decodes nothing.
+    ``request`` returns None if the message need not be requested now.
     """
 
     pending = False

@@ -147,8 +147,7 @@ class Transfers:
     def command_in_background(self, command: int, *params: float, was_just_sent: bool = False) -> None:
         """Send an optional command without waiting for its ack. Failures are ignored.
 
-        ``was_just_sent`` means that the caller has sent the command already. It is then sent again only if no ack
-        arrives.
+        If the caller has just sent the command (``was_just_sent``), it is sent again only if no ack arrives.
         """
         send = self._send_command
 
@@ -178,6 +177,6 @@ class Transfers:
                 if self._request_version is not None:
                     await self._request_version()
                 await self._version.wait_until(lambda _: True)
-            # There is no `request_version` for an autopilot, because its session requests the version until it arrives.
+            # An autopilot has no `request_version`: its session requests the version until it arrives.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
         return self.known_capabilities

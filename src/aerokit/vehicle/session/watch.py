@@ -67,8 +67,8 @@ class VehicleWatch:
         self._on_reboot = on_reboot
         # Time at which the last HEARTBEAT arrived.
         self.last_heartbeat_at: float = heartbeat_at
-        # Time at which it was processed. The HEARTBEAT that found the vehicle may be old, but must not make the vehicle
-        # silent at once.
+        # Time at which the last HEARTBEAT was processed. The HEARTBEAT that found the vehicle may be old; the minimum
+        # keeps the vehicle from being silent at once.
         self._heartbeat_read_at = max(self.last_heartbeat_at, connection.now() - SILENT_AFTER_S)
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
         self._state_tracker = LinkStateTracker(
@@ -86,10 +86,11 @@ class VehicleWatch:
         self._first_time: tuple[int, float] | None = None
         # By this clock, the connection recognises a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # Maps each clock to a time that has decreased, and when it was processed. Later messages may confirm it.
+        # Maps each clock whose time has decreased to the lowest time (ms), and to our time when it was processed.
+        # `_is_decrease_confirmed` decides whether this shows a reboot.
         self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
-        # Our time when the last answer to a TIMESYNC request was processed, and the vehicle's time in it (ms).
+        # The last answer to a TIMESYNC request: our time when it was processed, and the vehicle's time (ms).
         self._last_answer = (-math.inf, 0)
         attach = connection.bus.attach
         self._detach_callbacks: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
@@ -206,8 +207,8 @@ class VehicleWatch:
         """
         now = self._now()
         milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
-        # How far the vehicle's clock is behind its expected time. The result is too small if the earlier message was
-        # delayed, and too large if this message was: `EXPECTED_REBOOT_MIN_LAG_MS` allows for that.
+        # How far the vehicle's clock is behind its expected time. A delay of either message changes the result;
+        # `EXPECTED_REBOOT_MIN_LAG_MS` allows for that.
         behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
         if self._expects_reboot and behind_ms > EXPECTED_REBOOT_MIN_LAG_MS:
             self._on_reboot_detected(clock, milliseconds)
@@ -231,7 +232,7 @@ class VehicleWatch:
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        # Discard older times: later messages that are compared with them would show the same reboot again.
+        # Discard older times. A comparison with them would show the same reboot again.
         self._last_times = {clock: (milliseconds, now)}
         self._decreased_times = {}
         self._first_time = None

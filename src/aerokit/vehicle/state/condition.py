@@ -82,8 +82,8 @@ class SensorHealth(Snapshot):
 class EstimatorHealth(Snapshot):
     """State estimator health from EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
 
-    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that flight by
-    position needs and that are not good yet. Ratios are innovations divided by their limits: below 1 is good.
+    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that are needed for
+    flight by position but are not good yet. Ratios are innovations divided by their limits: below 1 is good.
     Accuracies are one standard deviation, in metres.
     """
 
@@ -128,8 +128,8 @@ class EstimatorHealth(Snapshot):
 class MissionProgress(Snapshot):
     """Index of the current mission item (the first is 0), and number of items.
 
-    Both are None if the vehicle has no mission, and each is None if the vehicle does not report it. ``state`` is a
-    MISSION_STATE: 0 unknown, 1 no mission, 2 not started, 3 active, 4 paused, 5 complete.
+    A value is None if the vehicle has no mission, or does not report the value. ``state`` is a MISSION_STATE: 0
+    unknown, 1 no mission, 2 not started, 3 active, 4 paused, 5 complete.
     """
 
     current: int | None
@@ -162,8 +162,7 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
     """Return the flight mode in CURRENT_MODE, which reports a change earlier than HEARTBEAT but lacks ``base_mode``."""
-    # Only HEARTBEAT shows whether a custom_mode of 0 is a mode, or means that no mode is set. The mode also depends on
-    # base_mode, which is unknown before the first HEARTBEAT.
+    # HEARTBEAT is needed too: it has base_mode, and it shows whether a custom_mode of 0 is a mode or means "no mode".
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)

@@ -172,7 +172,7 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
-    """Return all sensors reported so far, with the new reading in RANGEFINDER (older ArduPilot) as sensor 0."""
+    """Return all sensors reported so far. Older ArduPilot sends RANGEFINDER, which becomes sensor 0."""
     return _replaced(
         context.before, RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN), _id_of
     )
@@ -215,7 +215,7 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 def cell_voltages_mv(message: messages.BatteryStatus) -> list[int]:
     """Return the reported voltages, or an empty list if none is measured."""
-    # The voltages are those of single cells, or one of all cells together.
+    # These are the voltages of the single cells, or only the total voltage.
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
     # Cells 11 to 14 are an extension of the message, in which an absent cell may be 0 instead of U16.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
@@ -254,12 +254,12 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
-    """Return the current in amperes; None if the number is one of the autopilot's values for "unknown"."""
+    """Return the current in amperes; None if it is unknown."""
     return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
 
 
 def power(message: messages.PowerStatus) -> Power:
-    """Return the supply voltages; None for a 0 in the message, which means that the voltage is not measured."""
+    """Return the supply voltages. A voltage that is not measured (0 in the message) is None."""
     return Power(
         divided(message.Vcc, 1000, unknown=0),
         divided(message.Vservo, 1000, unknown=0),
@@ -275,7 +275,7 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
-    """Return all outputs reported so far, with the new values of this message's port, which has 16 outputs."""
+    """Return all outputs reported so far, updated by this message, which has the 16 outputs of one port."""
     frame = message.received_frame
     # MAVLink 1 has no extension fields, so the message has only the first eight outputs of the port.
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT
@@ -332,16 +332,13 @@ class GimbalAttitude(Snapshot):
 
 
 def from_status(message: MountStatus) -> GimbalAttitude:
-    """Return the attitude of MOUNT_STATUS; its yaw stays in the mount's frame (from north or from the nose)."""
+    """Return the attitude of MOUNT_STATUS. Its yaw, from north or from the nose, is not converted."""
     return GimbalAttitude(message.pointing_a / 100.0, message.pointing_b / 100.0, message.pointing_c / 100.0)
 
 
 def from_orientation(message: MountOrientation, heading: float | None) -> GimbalAttitude:
-    """Return the attitude of MOUNT_ORIENTATION, whose yaw from north may be missing.
-
-    ``heading`` is the vehicle's heading in degrees. While that is unknown too, ``yaw_deg`` is None.
-    """
-    # ``yaw_absolute`` is an extension field: 0 may mean that it was not sent.
+    """Return the attitude of MOUNT_ORIENTATION. ``heading`` is the vehicle's heading in degrees, None if unknown."""
+    # ``yaw_absolute`` (from north) is an extension field: 0 may mean that it was not sent.
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
         yaw = _rounded_to_360(message.yaw_absolute)
     else:
@@ -352,8 +349,8 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    Yaws from the nose and from north are converted by ``delta_yaw`` in the message, or by the vehicle's ``heading`` in
-    degrees. While both are unknown, the yaw that would need the conversion is None.
+    Yaw from the nose and yaw from north are converted to each other by ``delta_yaw`` in the message, or by the
+    vehicle's ``heading`` in degrees. If both are unknown, the result has only the yaw in the message.
     """
     pitch, roll, yaw = _euler(message.q)
     # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.

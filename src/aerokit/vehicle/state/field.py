@@ -41,7 +41,7 @@ class MessageSource(Generic[T]):
             of a function if `Telemetry` itself handles the message.
         needs_context: True if ``decode`` also takes a :class:`Context`.
         hz: the default rate to request, in Hz.
-        fallback: use the message only while no better message has reported the state recently.
+        fallback: ignore the message if a better one has reported the state recently.
         alternative: some autopilots send this message instead of the first message of the state.
         instance_field: the field that distinguishes several instances, all of which are kept.
         watched_hz: the rate to request instead of ``hz`` while your program waits for the state or follows it.
@@ -155,8 +155,8 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Even if the program reads no value, a frame is decoded at this interval. An undecoded frame is replaced by the next
-# one, which may lack some of its values. Without a fix, for example, the position is missing.
+# Even if the program reads no value, a frame is decoded at this interval. Otherwise later frames would replace it, and
+# after a loss of the fix, the last position would be missing.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.
@@ -166,10 +166,10 @@ _HEADER_LENGTH = 9
 class StreamedMessage:
     """One message type of a vehicle's autopilot. Keeps the latest frame, and decodes it when a value is read.
 
-    ``instance_at`` is the offset in the payload of the byte that distinguishes several instances. The latest frame of
-    each instance is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None if the frame is not decoded
-    yet. While one of the cells has observers, each frame is decoded when it arrives. Any thread may read a cell, so
-    ``lock`` protects this object.
+    ``instance_at`` is the offset of the instance number in the payload, None if the message has none. The latest frame
+    of each instance is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None if the frame is not
+    decoded yet. While one of the cells has observers, each frame is decoded when it arrives. Any thread may read a
+    cell, so ``lock`` protects this object.
     """
 
     __slots__ = (
@@ -195,15 +195,14 @@ class StreamedMessage:
         self._cells = cells
         self._apply = apply
         self._lock = lock
-        # Offset of the instance byte in `Frame.body` (the argument is its offset in the payload); None if there is only
-        # one instance.
+        # Offset of the instance number in `Frame.body`, None if the message has none.
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
         # The first frame that arrives at or after this time is decoded at once.
         self._decode_from = -math.inf
         # True while one of the cells has observers.
         self._is_watched = False
         self.pending: dict[int, Frame | Message] = {}
-        """The latest frame of each instance, until it is decoded (or its message, until that is applied)."""
+        """The latest frame or decoded message of each instance that was not applied to the cells yet."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
         """Keep a frame until a cell is read, or apply it now if that cannot wait.
@@ -230,8 +229,8 @@ class StreamedMessage:
         """Decode the pending frames in the order of their arrival."""
         with self._lock:
             to_apply: list[tuple[Frame, Message | None]] = []
-            # All frames are removed before the first one is decoded, because a decoder may read the previous value of
-            # a cell, and this access calls `catch_up` again.
+            # Remove all frames before the first one is decoded. A decoder may read the previous value of a cell, which
+            # calls `catch_up` again.
             while self.pending:
                 _, pending = self.pending.popitem()
                 if isinstance(pending, Frame):

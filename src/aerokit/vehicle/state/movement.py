@@ -121,10 +121,8 @@ class Wind(Snapshot):
 
 
 def valid_coordinates(latitude: int, longitude: int) -> tuple[float, float] | None:
-    """Convert 1e-7 degrees to degrees; return None for a place near 0°N 0°E, and for numbers out of range.
-
-    Autopilots without a fix report 0, 0 or a place near it: ArduPlane was observed to dead-reckon from 0, 0.
-    """
+    """Convert 1e-7 degrees to degrees; return None for a place near 0°N 0°E, and for numbers out of range."""
+    # Autopilots without a fix report 0°N 0°E. ArduPlane was also observed to dead-reckon from there.
     if abs(latitude) < MIN_COORDINATE and abs(longitude) < MIN_COORDINATE:
         return None
     if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
@@ -236,8 +234,9 @@ def wind(message: messages.Wind) -> Wind:
 
 
 def wind_of_covariance(message: messages.WindCov) -> Wind | None:
-    """Return the wind in WIND_COV (PX4); None if unknown. The message has the direction that the air moves to."""
+    """Return the wind in WIND_COV (PX4); None if unknown."""
     if not (math.isfinite(message.wind_x) and math.isfinite(message.wind_y)):
         return None
+    # The message has the direction that the air moves to.
     comes_from = math.degrees(math.atan2(-message.wind_y, -message.wind_x))
     return Wind(math.hypot(message.wind_x, message.wind_y), geo.wrap_360(comes_from), finite(message.wind_z))

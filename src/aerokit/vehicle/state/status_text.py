@@ -47,7 +47,7 @@ class StatusTextAssembler:
     def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
         """Add one message. Return the texts that are complete or truncated now.
 
-        By the standard, a text with the id 0 is not chunked. With ``joins_id_0``, it is treated like other texts.
+        By the standard, a text with the id 0 has a single chunk. Pass ``joins_id_0`` if it may have several.
         """
         truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
@@ -70,7 +70,7 @@ class StatusTextAssembler:
         return tuple(text for text in self._recent if text.at >= since)
 
     def about_failsafes(self) -> tuple[StatusText, ...]:
-        """Return the texts about failsafes and problems in flight (64 at most) since the latest failsafe ended."""
+        """Return up to 64 texts about failsafes and problems in flight, received since the last failsafe ended."""
         return tuple(self._failsafes)
 
     def clear_failsafes(self) -> None:
@@ -93,8 +93,8 @@ class StatusTextAssembler:
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
-                # A router has forwarded this chunk twice. The connection itself drops copies that arrive over another
-                # link (`MergedStreams`), so late copies are not expected here.
+                # A router has forwarded this chunk twice. Copies that arrive over another link are dropped earlier, by
+                # `MergedStreams`.
                 return
             # A new text with the same id begins, so the end of the previous text was lost.
             yield self._incomplete.pop(key).truncated(now)

@@ -38,9 +38,8 @@ Handler = Callable[[Any, Source], None]
 class Telemetry(States):
     """All state cells of one vehicle, updated by its messages.
 
-    It processes messages of component ``component_id`` (the autopilot) of system ``system_id``, and messages without a
-    frame, which the program itself has built. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT
-    shows which autopilot this is.
+    It processes the messages of the autopilot (``system_id``, ``component_id``), and messages that your program has
+    built, which have no frame. ``clock`` returns seconds. If ``autopilot`` is None, the first HEARTBEAT determines it.
     """
 
     autopilot: Autopilot
@@ -59,7 +58,7 @@ class Telemetry(States):
         self._knows_autopilot = autopilot is not None
         self._clock = clock
         self._lock = threading.RLock()  # Any thread may read a cell, and reading decodes pending frames.
-        # Arrival time of the message that is being processed; None if it has no frame, and between messages.
+        # Arrival time of the frame that is being processed; None if there is none.
         self._arrived_at: float | None = None
         self._texts = StatusTextAssembler()
         self.has_available_modes: bool = False
@@ -198,7 +197,7 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        # Calls may be nested, because a handler may read a cell, which then decodes another message.
+        # Restored below, because calls may be nested: a handler may read a cell, which then decodes another message.
         outer_arrived_at = self._arrived_at
         # The cells get the time at which the frame arrived as their timestamp.
         self._arrived_at = None if frame is None else frame.received_at
@@ -220,7 +219,7 @@ class Telemetry(States):
             for update in updates:
                 update(message, source)
 
-        # A ground station or companion may send heartbeats with the autopilot's ids; these update no cell.
+        # Ignore heartbeats that a ground station or companion sends with the autopilot's ids.
         def on_heartbeat(message: Any, source: Source) -> None:
             if self._accept_heartbeat(message):
                 update_all(message, source)
@@ -233,7 +232,7 @@ class Telemetry(States):
         """Return the function that updates the cell of a state from one type of message."""
         cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
-        # A frame that was kept undecoded may be older than a value from a message of another type.
+        # A frame that was kept undecoded must not replace a newer value from a message of another type.
         may_be_older = message_source.message in LAZY and len(field.sources) > 1
 
         def update(message: Any, source: Source) -> None:
@@ -250,7 +249,8 @@ class Telemetry(States):
         def update_with_context(message: Any, source: Source) -> None:
             context.before = cell.latest
             value = decode(message, context)
-            if value is not None:  # Older messages are not dropped here, because the value may combine several types.
+            if value is not None:
+                # A message older than the value is not dropped, because the value may combine several message types.
                 cell.set(value, source)
 
         chosen_update = update_with_context if message_source.needs_context else update
@@ -310,7 +310,7 @@ class Telemetry(States):
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
         # A text gets the time of its processing. After a pause of the event loop, its time of arrival may be before the
-        # command whose refusal it explains.
+        # time of the command that the text is about.
         joins_id_0 = self.autopilot.has_status_text_id_0
         self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=joins_id_0), source)
 
