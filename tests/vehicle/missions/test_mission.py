@@ -166,6 +166,29 @@ async def test_mission_end_with_lost_reports_is_no_takeover(lost: int, are_items
             await mission.wait_finished(timeout=600)
 
 
+async def test_px4_mission_that_ends_before_next_heartbeat_was_started() -> None:
+    """The vehicle is at the last waypoint already."""
+    async with armed(open_px4) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        for _ in range(2):
+            await anyio.sleep(3.0)
+            await mission.start(2)
+            await mission.wait_finished(timeout=5)
+            assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_px4_finished_mission_cannot_be_resumed() -> None:
+    async with armed(open_px4) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        await anyio.sleep(3.0)
+        with pytest.raises(OperationTimeout, match="No valid mission available"):
+            await mission.resume()
+
+
 async def go_home(vehicle: Vehicle) -> None:
     await vehicle.go_to(vehicle.home.value.position)
 

@@ -511,12 +511,21 @@ class MissionControl(VehiclePlan["Mission"]):
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         """Enter the mission mode by MISSION_START, or by a mode change if the vehicle does not support this command."""
         await self._order_mode(mode, order, timeout)
-        self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
+        if self._session.telemetry.is_in(mode):
+            self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
+
+    def _is_over(self, acknowledged_at: float) -> bool:
+        """Return True if PX4 has ended the mission before HEARTBEAT reported its mode, e.g. at the last waypoint."""
+        end_text = self._session.autopilot.mission_end_text
+        texts = self._session.texts_since(acknowledged_at)
+        return self._tracker.is_complete and end_text is not None and any(end_text in text for text in texts)
 
     async def _order_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle_context, session = self._vehicle_context, self._session
         if not session.autopilot.mission_starts_by_command:
-            await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)
+            await vehicle_context.sender.change_mode(
+                mode, order, timeout, reported_since=order.given_at, is_over=self._is_over
+            )
             return
         try:
             with vehicle_context.arbiter.changing_mode():
