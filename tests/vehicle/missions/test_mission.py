@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import anyio
@@ -177,6 +178,24 @@ async def test_px4_mission_that_ends_before_next_heartbeat_was_started() -> None
             await mission.start(2)
             await mission.wait_finished(timeout=5)
             assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_px4_mission_of_a_second_has_finished() -> None:
+    """No MISSION_CURRENT reports it as active, and one is lost when a report of completion counts again."""
+    async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=-4.0))
+        starting = asyncio.ensure_future(mission.start(2))
+        with flight.vehicle.subscribe(m.CommandAck) as acks:
+            assert (await acks.get()).command == MavCmd.DO_SET_MODE
+        lose_one = partial(flight.px4.faults.lose, m.MissionCurrent, times=1)
+        lose_one()
+        await starting
+        asyncio.get_running_loop().call_later(2.5, lose_one)
+        await mission.wait_finished(timeout=30)
 
 
 async def test_px4_finished_mission_cannot_be_resumed() -> None:

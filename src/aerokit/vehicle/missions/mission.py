@@ -176,7 +176,7 @@ class MissionEndDetector:
         # END_GRACE_S and for a MISSION_CURRENT before the mode counts as a failure.
         if self._left_at is None:
             self._left_at = now
-        has_report = self._tracker.progress.updated_at > self._left_at
+        has_report = self._tracker.progress.updated_at > max(self._left_at, self._tracker.stale_until)
         timeout_s = END_GRACE_S if has_report else END_REPORT_TIMEOUT_S
         if now - self._left_at < timeout_s or now < self._mode_grace_until:
             return None
