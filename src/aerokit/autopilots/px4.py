@@ -138,8 +138,10 @@ class Px4(Autopilot):
     unselectable_modes: frozenset[str] = frozenset(
         ("ORBIT", "RATTITUDE", "READY", "RTGS", "SIMPLE", "TERMINATION", "VTOL_TAKEOFF")
     ).union(f"EXTERNAL{number}" for number in range(1, 9))
-    # OFFBOARD is listed, because it needs a stream of set-points.
-    unarmable_modes: frozenset[str] = frozenset(("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION"))
+    # mode_requirements.cpp, and OFFBOARD, because it needs a stream of set-points.
+    unarmable_modes: frozenset[str] = frozenset(
+        ("FOLLOWME", "LAND", "OFFBOARD", "ORBIT", "PRECLAND", "RTL", "TERMINATION")
+    )
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",
