@@ -119,6 +119,7 @@ class Px4(Autopilot):
     unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # Inside PX4, −1 A (-100) means "unknown".
     reposition_purpose: Purpose = "hold"
     holds_after_mission = True
+    mission_end_text = "Mission finished"  # mission_base.cpp
     prearm_depends_on_mode = True
     # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
     runs_prearm_checks = True
@@ -137,8 +138,10 @@ class Px4(Autopilot):
     unselectable_modes: frozenset[str] = frozenset(
         ("ORBIT", "RATTITUDE", "READY", "RTGS", "SIMPLE", "TERMINATION", "VTOL_TAKEOFF")
     ).union(f"EXTERNAL{number}" for number in range(1, 9))
-    # OFFBOARD is listed, because it needs a stream of set-points.
-    unarmable_modes: frozenset[str] = frozenset(("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION"))
+    # mode_requirements.cpp, and OFFBOARD, because it needs a stream of set-points.
+    unarmable_modes: frozenset[str] = frozenset(
+        ("FOLLOWME", "LAND", "OFFBOARD", "ORBIT", "PRECLAND", "RTL", "TERMINATION")
+    )
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",

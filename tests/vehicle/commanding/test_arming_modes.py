@@ -19,7 +19,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, PlaneMode
 from aerokit.sim import SimulatedPlane, simulated_link
-from aerokit.sim.px4.modes import OFFBOARD
+from aerokit.sim.px4 import modes
 
 pytestmark = pytest.mark.anyio
 
@@ -169,14 +169,17 @@ async def take_over_later(flight: Flight) -> None:
     flight.copter.set_mode(CopterMode.LOITER)
 
 
-async def test_px4_left_in_offboard_arms() -> None:
+@pytest.mark.parametrize(
+    ("mode", "name"), [(modes.OFFBOARD, "OFFBOARD"), (modes.ORBIT, "ORBIT"), (modes.FOLLOW_TARGET, "FOLLOWME")]
+)
+async def test_px4_left_in_unarmable_mode_arms(mode: modes.Px4Mode, name: str) -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
-        flight.px4.switch_to(OFFBOARD)
-        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "OFFBOARD")
+        flight.px4.switch_to(mode)
+        await flight.vehicle.mode.wait_until(lambda reported: reported.name == name)
         await anyio.sleep(1.0)
         (reason,) = await flight.vehicle.why_not_armable()
-        assert "PX4 cannot arm in OFFBOARD" in reason
+        assert f"PX4 cannot arm in {name}" in reason
         await flight.vehicle.wait_ready(timeout=5.0)
         await flight.vehicle.arm()
         assert flight.vehicle.mode_name == "LOITER"

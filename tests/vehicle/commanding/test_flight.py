@@ -203,14 +203,16 @@ async def test_altitude_higher_than_outdated_one_is_no_climb(grounded: Flight, o
     here = vehicle.position.value
     grounded.copter.faults.silent = True
     await anyio.sleep(1.0)
-    vehicle.position.set(here.replace(altitude_relative_m=outdated_m), Source(1, 1, "GLOBAL_POSITION_INT"))
+    unknown = here.replace(altitude_relative_m=None, altitude_amsl_m=None)
+    outdated = unknown if outdated_m is None else here.offset(up_m=outdated_m)
+    vehicle.position.set(outdated, Source(1, 1, "GLOBAL_POSITION_INT"))
     await anyio.sleep(3.0)
     is_rising = vehicle._climb_detector()
     assert not is_rising()
     grounded.copter.faults.silent = False
-    await vehicle.position.wait_until(lambda place: place.altitude_relative_m not in (None, outdated_m))
+    await vehicle.position.wait_until(lambda place: place != outdated)
     assert not is_rising()
-    vehicle.position.set(here.replace(altitude_relative_m=5.0), Source(1, 1, "GLOBAL_POSITION_INT"))
+    vehicle.position.set(here.offset(up_m=5.0), Source(1, 1, "GLOBAL_POSITION_INT"))
     assert is_rising()
 
 

@@ -54,6 +54,32 @@ async def test_px4_take_off_uses_amsl_altitude_and_ends_in_loiter() -> None:
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=10.0)
 
 
+def move_home_up(flight: Px4Flight, metres: float) -> None:
+    """Correct the altitude of home, as PX4 does in the first two minutes of a flight (HomePosition.cpp)."""
+    north, east, down = flight.px4.home
+    flight.px4.home = (north, east, down - metres)
+
+
+@pytest.mark.parametrize("home_error_m", [-2.0, 2.0])
+async def test_take_off_ends_at_ordered_altitude_when_home_moves(home_error_m: float) -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        asyncio.get_running_loop().call_later(3.0, move_home_up, flight, home_error_m)
+        await flight.vehicle.take_off(12.0, timeout=30.0)
+        assert -flight.px4.motion.down == pytest.approx(12.0, abs=0.7)
+
+
+async def test_lost_take_off_is_repeated_although_home_moves() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        flight.px4.faults.ignore(MavCmd.NAV_TAKEOFF, times=1)
+        asyncio.get_running_loop().call_later(0.3, move_home_up, flight, -2.0)  # This is no climb.
+        await flight.vehicle.take_off(12.0, timeout=30.0)
+        assert len(flight.wire.commands(MavCmd.NAV_TAKEOFF)) == 2
+
+
 @pytest.mark.parametrize("tells_landed_state", [True, False])
 async def test_take_off_is_not_repeated_after_mode_report(
     monkeypatch: pytest.MonkeyPatch, tells_landed_state: bool
@@ -145,6 +171,13 @@ async def test_lost_order_right_after_take_off_is_repeated(order: Callable[[Vehi
         flight.px4.faults.ignore(MavCmd.DO_REPOSITION, times=1)
         await order(vehicle)
         assert len(flight.wire.commands(MavCmd.DO_REPOSITION)) == 2
+
+
+async def test_go_to_arrives_at_ordered_altitude_when_home_moves(flying: Px4Flight) -> None:
+    target = north_of_home(flying, 30.0, altitude_m=15.0)
+    asyncio.get_running_loop().call_later(2.0, move_home_up, flying, 4.0)
+    await flying.vehicle.go_to(target, timeout=60.0)
+    assert -flying.px4.motion.down == pytest.approx(15.0, abs=1.5)
 
 
 async def test_px4_go_to_cancelled_stops_in_place(flying: Px4Flight) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import anyio
@@ -164,6 +165,47 @@ async def test_mission_end_with_lost_reports_is_no_takeover(lost: int, are_items
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(lose_reports_of_end)
             await mission.wait_finished(timeout=600)
+
+
+async def test_px4_mission_that_ends_before_next_heartbeat_was_started() -> None:
+    """The vehicle is at the last waypoint already."""
+    async with armed(open_px4) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        for _ in range(2):
+            await anyio.sleep(3.0)
+            await mission.start(2)
+            await mission.wait_finished(timeout=5)
+            assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_px4_mission_of_a_second_has_finished() -> None:
+    """No MISSION_CURRENT reports it as active, and one is lost when a report of completion counts again."""
+    async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=-4.0))
+        starting = asyncio.ensure_future(mission.start(2))
+        with flight.vehicle.subscribe(m.CommandAck) as acks:
+            assert (await acks.get()).command == MavCmd.DO_SET_MODE
+        lose_one = partial(flight.px4.faults.lose, m.MissionCurrent, times=1)
+        lose_one()
+        await starting
+        asyncio.get_running_loop().call_later(2.5, lose_one)
+        await mission.wait_finished(timeout=30)
+
+
+async def test_px4_finished_mission_cannot_be_resumed() -> None:
+    async with armed(open_px4) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        await anyio.sleep(3.0)
+        with pytest.raises(OperationTimeout, match="No valid mission available"):
+            await mission.resume()
 
 
 async def go_home(vehicle: Vehicle) -> None:

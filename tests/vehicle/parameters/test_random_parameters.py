@@ -6,6 +6,7 @@ import contextlib
 import random
 from collections.abc import Callable, Coroutine
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest

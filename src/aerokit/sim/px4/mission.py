@@ -137,6 +137,7 @@ class Px4Mission:
         self.current: int = 0  # Index of the item that is flown now or next.
         self.reached: int = -1  # Index of the item that was reached last; -1 if there is none.
         self.is_finished: bool = False  # True after the last item was completed.
+        self._needs_selection = False  # True from the end of the mission until an item is selected.
         self.is_valid: bool = False  # True if there is a mission and it can be flown.
         self._phase = ""  # Phase of the current item: "climb", "go" or "land".
         self._arrived_at = math.nan  # time of arrival at the current item; NaN before
@@ -182,7 +183,7 @@ class Px4Mission:
 
     def on_replaced(self, current: int) -> None:
         self.current = max(0, current)
-        self.is_finished = False
+        self.is_finished = self._needs_selection = False
         self.forget_reached()
         self._jumps.clear()
         self._check()
@@ -214,6 +215,7 @@ class Px4Mission:
 
     def set_current(self, seq: int) -> None:
         self.current = seq
+        self._needs_selection = False
         self._jumps.clear()
         if self._px4.mode == MISSION:
             self.is_finished = False
@@ -222,13 +224,17 @@ class Px4Mission:
     def enter(self) -> None:
         if not self.is_valid:
             return
-        # A finished mission starts again, unless another item was selected after its end.
-        is_still_finished = self.is_finished and self.current == self.count - 1
-        if self.current >= self.count or is_still_finished:
+        # In the air, PX4 flies a finished mission again only after an item was selected. On the ground it starts again
+        # (mission_base.cpp, checkMissionRestart).
+        if self._needs_selection and self._px4.is_armed and not self._px4.is_landed:
+            self._px4.send_text(MavSeverity.CRITICAL, "No valid mission available, loitering")
+            self._px4.call_later(0.0, self._hold)
+            return
+        if self.current >= self.count or self._needs_selection:
             self.current = 0
             self.forget_reached()
             self._jumps.clear()
-        self.is_finished = False
+        self.is_finished = self._needs_selection = False
         if self._px4.is_armed:
             self._px4.info("Executing Mission")
         self._begin_item()
@@ -380,7 +386,7 @@ class Px4Mission:
 
     def _finish(self) -> None:
         px4 = self._px4
-        self.is_finished = True
+        self.is_finished = self._needs_selection = True
         self.current = max(0, min(self.current, self.count - 1))  # The last item stays current.
         if px4.is_landed:
             px4.info("Mission finished, landed")

@@ -101,7 +101,7 @@ class FlightActions(VehicleBase):
         try:
             with self._flight_cleanup.flying(order):
                 await self._begin_take_off(plan, order)
-                await self._await_altitude(altitude_m, timeout, max_silence_s, order)
+                await self._await_altitude(altitude_m, plan, timeout, max_silence_s, order)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the command, so it is ordered to hold.
             self._flight_cleanup.hold_in_background(order)
@@ -157,30 +157,35 @@ class FlightActions(VehicleBase):
             return lambda: False  # A climb during an earlier take-off proves nothing.
         # Without a recent altitude, the climb is measured from the first one that is received.
         is_start_known = self._position.was_received_since(started - POSITION_MAX_AGE_S)
-        start_m = self._position.altitude_relative() if is_start_known else -math.inf
+        start_m = self._position.altitude_amsl() if is_start_known else -math.inf
         state_before = landed.latest
 
         def is_rising() -> bool:
             nonlocal start_m
             if start_m == -math.inf and self._position.was_received_since(started):
-                start_m = self._position.altitude_relative()
+                start_m = self._position.altitude_amsl()
             has_taken_off = landed.latest in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF)
             is_reported = has_taken_off and landed.latest != state_before
-            has_climbed = start_m > -math.inf and self._position.altitude_relative() > start_m + CLIMB_DETECTED_M
+            has_climbed = start_m > -math.inf and self._position.altitude_amsl() > start_m + CLIMB_DETECTED_M
             return is_reported or has_climbed
 
         return is_rising
 
     async def _await_altitude(
-        self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
+        self, altitude_m: float, plan: TakeOff, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
         # A vehicle that hovers at the altitude may be slightly below it, but not on the ground.
-        min_altitude_m = altitude_m - min(max(0.5, 0.05 * altitude_m), 0.5 * altitude_m)
+        tolerance_m = min(max(0.5, 0.05 * altitude_m), 0.5 * altitude_m)
+        is_amsl = self.autopilot.take_off_needs_home()
         started = self.connection.now()
 
+        def missing_m() -> float:
+            if is_amsl:  # The ordered altitude stays when PX4 corrects the altitude of home in flight.
+                return plan.params[6] - self._position.altitude_amsl()
+            return altitude_m - self._position.altitude_relative()
+
         def is_up() -> bool:
-            is_known = self._position.was_received_since(started)
-            return is_known and self._position.altitude_relative() >= min_altitude_m and not order.end
+            return self._position.was_received_since(started) and missing_m() <= tolerance_m and not order.end
 
         with self._session.streaming("position"):
             await await_progress(

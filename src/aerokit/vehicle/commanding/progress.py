@@ -307,6 +307,11 @@ class VehiclePosition:
         altitude = height_above_home(self._telemetry)
         return -math.inf if altitude is None else altitude
 
+    def altitude_amsl(self) -> float:
+        """Return the altitude above mean sea level in metres; −inf while unknown."""
+        here = self._telemetry.position.latest
+        return -math.inf if here is None or here.altitude_amsl_m is None else here.altitude_amsl_m
+
     def home_altitude(self) -> float:
         """Return the altitude above mean sea level in metres. Raises ValueUnknownError if it is unknown."""
         return self._telemetry.home.value.altitude_amsl_m
@@ -334,6 +339,17 @@ class VehiclePosition:
             is_relative = False
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, frame
+
+    def as_ordered(self, target: Position) -> Position:
+        """Return the target with the kind of altitude that the vehicle is ordered to; see :meth:`global_target`.
+
+        PX4 corrects the altitude of home in the first two minutes of a flight (HomePosition.cpp). The altitude above
+        mean sea level that it was ordered to stays.
+        """
+        if target.altitude_relative_m is None or self.accepts_relative_altitude:
+            return target
+        altitude_m = self.home_altitude() + target.altitude_relative_m
+        return target.replace(altitude_relative_m=None, altitude_amsl_m=altitude_m)
 
     def command_place(self, target: Position, name: str = "target") -> dict[str, Any]:
         """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""

@@ -63,7 +63,6 @@ class RoundFlight:
         self._session = context.session
         self._telemetry = context.session.telemetry
         self._operation = operation
-        self._center = center
         self._counter = counter
         self._rounds = math.inf if rounds is None else rounds
         max_distance_m, self._timeout, self._max_silence_s = limits
@@ -73,6 +72,7 @@ class RoundFlight:
         position = context.vehicle_position
         # The center as arguments of a COMMAND_INT.
         self._place = position.command_place(center, center_name)
+        self._center = position.as_ordered(center)
         position.check_reach(center_name, [center], max_distance_m)
         position.check_flying(operation)
 

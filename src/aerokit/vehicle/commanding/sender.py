@@ -139,9 +139,18 @@ class OrderSender:
     # ----------------------------------------------------------------------------------- modes
 
     async def change_mode(
-        self, mode: Mode, order: Order, timeout: float = 6.0, *, reported_since: float = -math.inf
+        self,
+        mode: Mode,
+        order: Order,
+        timeout: float = 6.0,
+        *,
+        reported_since: float = -math.inf,
+        is_over: Callable[[float], bool] = lambda _: False,
     ) -> None:
-        """Order the mode and wait until a message received after ``reported_since`` reports it."""
+        """Order the mode and wait until a message received after ``reported_since`` reports it.
+
+        ``is_over(acknowledged_at)`` returns True if the vehicle has left the mode again before HEARTBEAT reported it.
+        """
         started = self._session.connection.now()
         was_in_doubt = self._arbiter.mode_is_in_doubt
         with self._session.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
@@ -151,7 +160,9 @@ class OrderSender:
             if was_in_doubt:  # Earlier reports may be effects of an earlier mode change.
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
-            await self.await_mode(mode, order, refusals, remaining_s, reported_since)
+            await self.await_mode(
+                mode, order, refusals, remaining_s, reported_since, is_over=lambda: is_over(acknowledged_at)
+            )
             self._arbiter.settle_mode()
 
     async def request_mode(
@@ -189,14 +200,21 @@ class OrderSender:
             order.was_refused = False
 
     async def await_mode(
-        self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
+        self,
+        mode: Mode,
+        order: Order,
+        refusals: list[CommandAck],
+        timeout: float,
+        reported_since: float,
+        *,
+        is_over: Callable[[], bool] = lambda: False,
     ) -> None:
         """Wait until a recent message received after ``reported_since`` reports the mode."""
         telemetry = self._session.telemetry
 
         def is_reported() -> bool:
             is_recent = telemetry.mode.updated_at > reported_since and telemetry.mode.age <= MODE_MAX_AGE_S
-            return telemetry.is_in(mode) and is_recent
+            return (telemetry.is_in(mode) and is_recent) or is_over()
 
         await self.await_effect(
             f"set_mode({mode.name})",

@@ -112,6 +112,7 @@ class TravelActions(VehicleBase):
         """
         target = travel_target(target)
         place = self._position.command_place(target)
+        target = self._position.as_ordered(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m)
         self._position.check_reach("target", [target], max_distance_m)
         arrival_radius_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m

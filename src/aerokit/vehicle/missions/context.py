@@ -201,7 +201,7 @@ class MissionTracker:
         # True once the vehicle has flown the mission, until the mission ends.
         self._was_active = False
         # A report of completion before this time may be about the previous flight.
-        self._stale_until = -math.inf
+        self.stale_until: float = -math.inf
         telemetry = session.telemetry
         session.at_close(
             telemetry.mission_current.observe(self._on_current, every_arrival=True),
@@ -240,7 +240,7 @@ class MissionTracker:
         if not self._was_active:
             self.is_complete = False
             # Reports of completion before this time are about the previous flight.
-            self._stale_until = self._session.connection.now() + STALE_STATE_S
+            self.stale_until = self._session.connection.now() + STALE_STATE_S
 
     def forget(self) -> None:
         for cell in (self.current, self.count, self.progress):
@@ -285,11 +285,11 @@ class MissionTracker:
 
     def _on_state(self, state: int) -> None:
         if state != MissionState.COMPLETE:
-            self._stale_until = -math.inf
+            self.stale_until = -math.inf
             if state == MissionState.ACTIVE and self.is_in_mission_mode and self._session.telemetry.is_armed:
                 self._was_active = True
                 self.is_complete = False
-        elif self._session.connection.now() >= self._stale_until:
+        elif self._session.connection.now() >= self.stale_until:
             self._complete()
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:

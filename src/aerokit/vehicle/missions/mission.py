@@ -169,7 +169,7 @@ class MissionEndDetector:
         # mode is therefore a failure only after END_GRACE_S and a MISSION_CURRENT.
         if self._left_at is None:
             self._left_at = now
-        has_report = self._tracker.progress.updated_at > self._left_at
+        has_report = self._tracker.progress.updated_at > max(self._left_at, self._tracker.stale_until)
         timeout_s = END_GRACE_S if has_report else END_REPORT_TIMEOUT_S
         if now - self._left_at < timeout_s or now < self._mode_grace_until:
             return None
@@ -499,12 +499,21 @@ class MissionControl(VehiclePlan["Mission"]):
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         await self._order_mode(mode, order, timeout)
-        self._tracker.discard_completion()  # Until now, the vehicle may have reported the end of the previous flight.
+        if self._session.telemetry.is_in(mode):
+            self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
+
+    def _is_over(self, acknowledged_at: float) -> bool:
+        """Return True if PX4 has ended the mission before HEARTBEAT reported its mode, e.g. at the last waypoint."""
+        end_text = self._session.autopilot.mission_end_text
+        texts = self._session.texts_since(acknowledged_at)
+        return self._tracker.is_complete and end_text is not None and any(end_text in text for text in texts)
 
     async def _order_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle_context, session = self._vehicle_context, self._session
         if not session.autopilot.mission_starts_by_command:
-            await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)
+            await vehicle_context.sender.change_mode(
+                mode, order, timeout, reported_since=order.given_at, is_over=self._is_over
+            )
             return
         try:
             with vehicle_context.arbiter.changing_mode():
