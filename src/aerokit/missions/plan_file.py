@@ -164,7 +164,7 @@ def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     yield _missing_in("rallyPoints", rally, "version")
 
 
-# These three functions ignore values of an unexpected type. Reading such a value raises an error about it later.
+# The following three functions skip values of an unexpected type. The functions that read the plan raise the error.
 
 
 def _member(value: Any, key: str) -> Any:

@@ -38,9 +38,10 @@ MAX_SILENCE_S = 5.0
 
 
 class CameraLink(CameraOrders):
-    """One camera, addressed by component id, and by device id if it is attached to the autopilot.
+    """Sends commands to one camera and receives its messages.
 
-    ``number`` is one of these ids. Without it, the link binds to the first camera that is found.
+    ``number`` is 1 to 6 for a camera attached to the autopilot, otherwise its component id. None: the first camera that
+    is found.
     """
 
     def __init__(

@@ -214,8 +214,7 @@ class PhotoInterval:
         self._new_captures = CaptureQueue(self._log)
         # Index of the capture to deliver next.
         self._next_index: int | None = None
-        # `reset_at` of the log when `_next_index` was determined. After a newer reset, the camera counts from 0 again,
-        # so that `_next_index` is no longer valid.
+        # The log's last reset for which `_next_index` is valid. After a newer reset, the camera counts from 0 again.
         self._known_reset_at = self._log.reset_at
         # The last capture, if it may be the first one after a reset; see `_first_after_reset`.
         self._possible_first: Capture | None = None
@@ -390,10 +389,10 @@ class PhotoInterval:
             self._next_index = following_index
 
     async def _check_silence(self, silent_checks: int) -> None:
-        """Ask the camera why no capture has arrived, and request the next capture if its report was lost.
+        """Request the camera's status, and the next capture if the status shows that it was taken.
 
-        Raises OperationRejected if the camera has ended the series, and OperationTimeout at the last of
-        ``MAX_SILENT_CHECKS`` checks.
+        Raises OperationRejected if the camera has ended the series, and OperationTimeout after ``MAX_SILENT_CHECKS``
+        checks without a capture.
         """
         status = await self._shutter.request_status(2.0 * CHECK_INTERVAL_S)
         self._collect()

@@ -86,11 +86,11 @@ class ImpactDetector:
         velocity, updated_at = cell.latest, cell.updated_at
         if velocity is None or updated_at == self._updated_at:
             return
-        if updated_at < self._updated_at:  # The computer slept, so the last velocity got an earlier time.
+        if updated_at < self._updated_at:  # The computer slept; this makes all values older.
             self._updated_at, self._sank_fast_at = updated_at, -math.inf
             return
-        # An impact may be shorter than the interval between two received velocities. It then shows in two consecutive
-        # velocities, so these are compared even if the interval is long.
+        # An impact may be shorter than the interval between two velocities, so consecutive velocities are compared even
+        # if the interval is long.
         interval_s = min(updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = updated_at
@@ -106,7 +106,7 @@ class ImpactDetector:
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s = self._max_sink_m_s
-                # This height may be old. Without one, no later height could show that the vehicle flies on.
+                # Even an old height is needed, so that a later height can show that the vehicle flies on.
                 self._impact_height_m = height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.
@@ -133,7 +133,8 @@ class ImpactDetector:
 class GroundCheck:
     """Distinguishes a vehicle on the ground from one that falls, and a landing from a fall.
 
-    ArduCopter and PX4 report ON_GROUND whenever they are disarmed (AP_Arming_Copter.cpp, MulticopterLandDetector.cpp).
+    A report of ON_GROUND is not sufficient: ArduCopter and PX4 also send it when they were disarmed in the air
+    (AP_Arming_Copter.cpp, MulticopterLandDetector.cpp).
     """
 
     def __init__(self, session: VehicleSession) -> None:

@@ -237,7 +237,7 @@ class Order:
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """Make the device's previous order valid again, because this one was refused or not acknowledged."""
+        """Take this order back, for example after a refusal. The previous order becomes valid again."""
         self.is_withdrawn = True
 
     def commit(self) -> None:
@@ -269,8 +269,7 @@ class Order:
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
         elif is_expected and is_settled:
-            # An earlier order of the program has changed the mode. If the mode from before appears again, another party
-            # has set it.
+            # An earlier order of the program has changed the mode. If `mode_before` returns, another party has set it.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:

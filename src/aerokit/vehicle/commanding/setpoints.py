@@ -205,10 +205,10 @@ class SetpointEncoder:
     def body_velocity(self, setpoint: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
-        For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the reported heading. In
-        MAV_FRAME_BODY_NED, ArduPilot treats yaw as a turn: ArduCopter adds it to its previous target heading, Rover to
-        its present heading. Turns computed from the reported heading would make the heading oscillate. Raises
-        StaleValueError if the reported heading is old, because the vehicle would move in a wrong direction.
+        In MAV_FRAME_BODY_NED, ArduPilot treats yaw as a turn from the previous target heading (ArduCopter) or from the
+        present heading (Rover). A set-point with a heading is therefore converted to MAV_FRAME_LOCAL_NED by the
+        reported heading. Raises StaleValueError if the reported heading is old, because the vehicle would then move in
+        a wrong direction.
         """
         forward, right, frame = setpoint.forward_m_s, setpoint.right_m_s, MavFrame.BODY_NED
         if setpoint.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:

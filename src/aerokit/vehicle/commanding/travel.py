@@ -56,12 +56,12 @@ RESEND_INTERVAL_S = 1.0
 # The vehicle has arrived once it has been within the arrival radius for this many seconds.
 ARRIVED_FOR_S = 0.5
 
-# A direction is sent only for turns between these angles. ArduPilot measures the direction from its own target heading,
-# so near 0 and 360 degrees it might turn almost a full circle (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad). In between,
-# the shorter way might be the wrong one.
+# A direction is sent only for turns between these angles, for which the shorter way might be the wrong one. ArduPilot
+# measures the direction from its own target heading, so for other turns, a direction might cause almost a full circle
+# (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
 MIN_DIRECTED_TURN_DEG, MAX_DIRECTED_TURN_DEG = 170, 350
 
-# Seconds to wait for the acknowledgement of a turn with a direction, which is sent only once.
+# The command for a turn with a direction is sent only once, with this many seconds for its acknowledgement.
 DIRECTED_TURN_ACK_TIMEOUT_S = 4.0
 
 
@@ -89,9 +89,9 @@ class TravelActions(VehicleBase):
         vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, only the
-                altitude above home is used, and it counts from the home of this vehicle. A position of another vehicle
-                may count from another home. Without an altitude, or if the target is ``vehicle.home.value``, the
+            target: latitude and longitude, and an altitude above the home of this vehicle or above mean sea level. If
+                it has both, the altitude above home is used. Caution: the position of another vehicle has an altitude
+                above the home of that vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the
                 present altitude is kept.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
@@ -173,7 +173,7 @@ class TravelActions(VehicleBase):
             if error.result != MavResult.UNSUPPORTED:
                 raise
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
-            self._sender.raise_if_ended(order)  # `await_recent_state` checks this only if it has to wait.
+            self._sender.raise_if_ended(order)  # `await_recent_state` does this only if it waits.
             await self._sender.await_recent_state(order)
             ignored = dict.fromkeys(("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate"), 0.0)
             message = SetPositionTargetGlobalInt(
@@ -267,8 +267,8 @@ class TravelActions(VehicleBase):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left. The vehicle turns the shorter way. Exception: for a relative angle of 170 to 350 degrees,
-                ArduPilot turns right if the angle is positive, and left if it is negative.
+                left. The vehicle turns the shorter way, but ArduPilot turns relative angles of ±170 to ±350 degrees in
+                the direction of their sign.
             relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
