@@ -3443,11 +3443,10 @@ class Camera(TwinOf["AsyncCamera"]):
         return self._loop.call(self.aio.captures)
 
     def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """Request missing captures, and return all captures in the camera's log.
+        """Return the captures in the camera's log, also those from before this program started.
 
-        These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
-        three successive captures that the camera does not send.
+        Missing captures are requested, the newest first, until the camera does not send three in succession. At most
+        the newest 20,000 are returned; a camera attached to the autopilot has only its newest capture.
 
         Args:
             timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
@@ -4887,9 +4886,10 @@ class Vehicle(VehicleTwin):
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
         order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
-        next heartbeat. Sends MAV_CMD_DO_REPOSITION
-        (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support this command.
+        next heartbeat.
+
+        Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or
+        SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not support this command.
 
         Args:
             target: latitude and longitude, and an altitude above the home of this vehicle or above mean sea level. If

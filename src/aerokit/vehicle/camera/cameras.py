@@ -122,11 +122,10 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         return self._log.captures()
 
     async def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """Request missing captures, and return all captures in the camera's log.
+        """Return the captures in the camera's log, also those from before this program started.
 
-        These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
-        three successive captures that the camera does not send.
+        Missing captures are requested, the newest first, until the camera does not send three in succession. At most
+        the newest 20,000 are returned; a camera attached to the autopilot has only its newest capture.
 
         Args:
             timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.

@@ -74,8 +74,7 @@ class CameraLink(CameraOrders):
         self._is_bound = anyio.Event()
         # Time of the camera's last HEARTBEAT.
         self._heartbeat_at = -math.inf
-        # True after a silence of an identified camera until it has identified itself again, because another camera may
-        # use its id now.
+        # True if an identified camera was silent and must identify itself again: another camera may now use its id.
         self._must_identify_again = False
         self._session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")
@@ -319,7 +318,7 @@ class ActiveOperation:
                 self.discard()
             else:  # The camera may have started nevertheless.
                 self.order.commit()
-                # Raise the error without delay: the stop command is sent at once, and retried in the background.
+                # Do not wait for the answer to the stop command, so that the error is raised without delay.
                 await self.stop(is_awaited=False)
             raise
         self.order.commit()

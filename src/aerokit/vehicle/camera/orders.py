@@ -40,8 +40,8 @@ MAX_ORDER_ATTEMPTS = 8
 class _ResendGuard:
     """Decides whether a command to a camera may be sent again.
 
-    A camera with its own component id must have sent a message since the command, because the autopilot's HEARTBEAT
-    does not show that the camera is present.
+    For a camera with its own component id, the camera's HEARTBEAT counts instead of the autopilot's, which does not
+    show that the camera is present.
     """
 
     def __init__(self, link: CameraOrders, sent: SentCommand) -> None:

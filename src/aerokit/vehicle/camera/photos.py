@@ -326,12 +326,12 @@ class PhotoInterval:
                 self._is_start_guessed = False
                 self._set_newest(first.index)
                 self._waiting = {first.index: first}
-            # Without a status, the first capture determines the start. A later capture with a much lower index shows
-            # that the first index was corrupt, and then determines the start instead.
+            # Without a status, the index of the first capture counts as the start of the series. A later capture with a
+            # much lower index shows that this index was corrupt, and counts as the start instead.
             if self._next_index is None or self._contradicts_guess(capture.index):
                 self._is_start_guessed = self._next_index is None  # A corrected start is not corrected again.
                 self._next_index = capture.index
-                self._waiting.clear()  # It may have the capture with the corrupt index.
+                self._waiting.clear()  # It may contain the capture with the corrupt index.
                 # One less than the index of this capture, so that the comparison at the end of the loop accepts it.
                 self._newest_index = capture.index - 1
             if not self._is_plausible(capture.index):

@@ -98,8 +98,8 @@ HOLD_CLOSE_TIMEOUT_S = 1.5
 # Maximum number of attempts to hold a vehicle that was silent. The first attempt follows when the silence ends.
 MAX_HOLD_ATTEMPTS = 3
 
-# A hold that was sent without waiting is repeated if it is not acknowledged within this many seconds, and at most this
-# many times.
+# A hold that was sent without waiting is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most
+# MAX_HOLD_RESENDS times.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
 # NaN means the present position, so the vehicle brakes and does not fly back to a point that it has passed.

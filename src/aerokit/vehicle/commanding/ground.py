@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.telemetry import Telemetry
 
 SETTLING_S, SETTLED_M_S = 0.5, 2.0
-"""A vehicle on the ground moves up or down slower than this speed for at least this time, even on a ship.
+"""A vehicle on the ground, even on a ship, moves up or down slower than SETTLED_M_S for at least SETTLING_S seconds.
 
-A vehicle whose motors stop while it climbs is slower than this speed for 0.4 s at most.
+A vehicle whose motors stop while it climbs is slower than SETTLED_M_S for 0.4 s at most.
 """
 
 STANDING_S, STANDING_M = 5.0, 2.0
-"""A vehicle whose height changes by less than this distance in this time is on the ground.
+"""A vehicle whose height changes by less than STANDING_M metres in STANDING_S seconds is on the ground.
 
 This applies whatever velocity the vehicle reports, because the velocity may be wrong.
 """
@@ -34,7 +34,10 @@ Autopilots descend at 5 m/s at most, and slow down before the touchdown.
 """
 
 IMPACT_STOP_S = 0.7
-"""A descent at ``IMPACT_M_S`` that ends within this time is an impact. Autopilots need longer to brake."""
+"""A vehicle that sinks at ``IMPACT_M_S`` and stops within this many seconds has hit the ground.
+
+Autopilots need longer to brake.
+"""
 
 MAX_INTERVAL_S = 3.5
 """After a longer interval between two velocities, nothing is known about what happened in between."""
@@ -194,9 +197,8 @@ class GroundCheck:
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
-            # The reported velocity may be wrong. If the height has not changed for STANDING_S, the vehicle stands on
-            # the ground although it reports a velocity. `current_height` ignores old heights, because an outdated
-            # height would not change in a fall either.
+            # The reported velocity may be wrong: if the height has not changed for STANDING_S, the vehicle stands on
+            # the ground. `current_height` ignores old heights, which would not change in a fall either.
             height_m = self._impact.current_height()
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, STANDING_M)

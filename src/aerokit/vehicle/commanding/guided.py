@@ -41,8 +41,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# Some autopilots restart their path at each position set-point. A new set-point is sent this many times at the stream's
-# rate, because one may be lost, and then only at this interval in seconds.
+# For autopilots that restart their path at each position set-point: a new one is sent INITIAL_REPEATS times at the
+# stream's rate, because one may be lost, and then only every REPEAT_INTERVAL_S seconds.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
 # Set-points that the autopilot executes with its own limits of acceleration. With these, a sudden stop is an impact.

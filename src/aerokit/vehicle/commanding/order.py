@@ -159,7 +159,7 @@ class Order:
         self.armed = armed
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
         self.may_move: bool = False
-        """True once the vehicle may move because of this or an earlier order; if abandoned, it must then hold."""
+        """True once the vehicle may move because of this or an earlier order. It must hold if this one is abandoned."""
         self.was_refused: bool = False
         """True if the vehicle refused the order, and therefore continues its previous task."""
         self.was_flown_before: bool = False
@@ -185,7 +185,7 @@ class Order:
         self.arm_command: int | None = None
         """Number of the order's arm or disarm command among those of the program; None until it was sent."""
         self.was_sent: bool = False
-        """True once the first transmission of a command of the order began. The next command is a further step."""
+        """True once the first transmission of the order's first command began."""
         self.only_stops: bool = False
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_closed: bool = False

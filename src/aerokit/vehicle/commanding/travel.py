@@ -84,9 +84,10 @@ class TravelActions(VehicleBase):
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
         order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
-        next heartbeat. Sends MAV_CMD_DO_REPOSITION
-        (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support this command.
+        next heartbeat.
+
+        Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or
+        SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not support this command.
 
         Args:
             target: latitude and longitude, and an altitude above the home of this vehicle or above mean sea level. If
@@ -147,8 +148,8 @@ class TravelActions(VehicleBase):
             self._flight_cleanup.hold_in_background(order)
             raise
         except OperationRejected:
-            # The vehicle is on its way, but has refused the speed or the heading, or the computer slept before these
-            # were sent. After a takeover, nothing is sent.
+            # The vehicle is on its way, but the speed or the heading was refused or not sent. After a takeover,
+            # `hold_in_background` sends nothing.
             if is_incomplete:
                 self._flight_cleanup.hold_in_background(order)
             raise
