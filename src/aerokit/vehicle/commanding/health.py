@@ -206,8 +206,7 @@ class Health:
 
     def _failing_sensors(self) -> list[str]:
         sensors = self._telemetry.sensors.latest
-        # In a mode that does not allow arming, PX4 reports what this mode requires. The report then does not show what
-        # arming in another mode requires.
+        # In a mode that does not allow arming, PX4 reports what this mode requires, and not what arming requires.
         is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is None or sensors.prearm_checks_pass is True or is_meaningless:
             return []

@@ -237,7 +237,7 @@ class Order:
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """Take this order back, for example after a refusal. The previous order becomes valid again."""
+        """Take this order back, for example after a refusal. The device's previous order becomes valid again."""
         self.is_withdrawn = True
 
     def commit(self) -> None:
