@@ -52,9 +52,9 @@ IMPACT_HEIGHT_M = 3.0
 """If the height changes by this distance after a sudden stop, the stop was not on the ground."""
 
 MIN_DROP_M = 1.0
-"""A vehicle that falls until it sinks at ``IMPACT_M_S`` loses 1.8 m of height.
+"""A vehicle that has lost less height than this has not fallen: only its reported velocity has jumped.
 
-If it has lost less height than this constant, only its reported velocity has jumped.
+A vehicle that falls until it sinks at ``IMPACT_M_S`` loses 1.8 m of height.
 """
 
 MAX_SLIDE_M_S = 8.0

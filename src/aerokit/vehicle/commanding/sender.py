@@ -97,7 +97,7 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for a recent HEARTBEAT before a further command of an order. Before the first, ``order`` is None.
+        """Wait for a recent HEARTBEAT before a command. ``order`` is None before the first command of an order.
 
         Raises OperationRejected if the order has ended or the computer slept, and HeartbeatTimeout if there is no
         HEARTBEAT for ``MAX_SILENCE_S``.
