@@ -311,5 +311,5 @@ def point_gimbal(*, pitch_deg: float = 0.0, roll_deg: float = 0.0, yaw_deg: floa
     return action_item(
         MavCmd.DO_MOUNT_CONTROL,
         *(in_range(name, value, -180, 180) for name, value in angles),
-        z=float(MavMountMode.MAVLINK_TARGETING),  # An item has param7, which is the mode here, in `z`.
+        z=float(MavMountMode.MAVLINK_TARGETING),  # `z` is param7, the mode.
     )

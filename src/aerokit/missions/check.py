@@ -34,9 +34,9 @@ _GLOBAL_TEXT = "a global frame: 0, 3, 10, or 5, 6, 11"
 def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool | None = None) -> None:
     """Raise InvalidArgument if an item cannot be sent. ``items`` are without home.
 
-    With ``home_is_item_0`` (ArduPilot), home takes the place of one item, so 65,534 others are allowed. If it is
-    False, a destination at 0°, 0° is refused, because only ArduPilot takes it for the current position. None stands
-    for an unknown autopilot: 65,535 items and 0°, 0° are allowed.
+    ``home_is_item_0`` is True for ArduPilot: at most 65,534 items, because home takes the place of one. It is False for
+    other autopilots: no destination at 0°, 0°, which only ArduPilot takes for the current position. It is None for an
+    unknown autopilot: 65,535 items and 0°, 0° are allowed.
     """
     check_count(len(items), home_is_item_0=bool(home_is_item_0))
     for index, item in enumerate(items):

@@ -37,7 +37,7 @@ FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
 class ItemStorage(Enum):
-    """Form in which items are stored. Comparisons tolerate the loss of precision that this form causes."""
+    """How items that were read back had been stored. Comparisons tolerate the changes that this causes."""
 
     WIRE = "wire"
     """Only changes made by MISSION_ITEM_INT: rounding to 32-bit floats, and equivalent frames."""
@@ -159,10 +159,7 @@ def _px4_letters(item: MissionItem) -> str:
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the value that the vehicle reports after it has stored ``value`` in this form.
-
-    Yields nothing if the value is out of the form's range.
-    """
+    """Yield the value that is read back after it was stored as ``letter`` says; nothing if it cannot be stored."""
     if letter == "-":  # not stored
         yield 0.0
     elif letter == "2":  # always 2
@@ -292,7 +289,7 @@ def _frames_match(expected: MissionItem, actual: MissionItem, storage: ItemStora
     expected_frame, actual_frame = canonical_frame(expected.frame), canonical_frame(actual.frame)
     if expected_frame == actual_frame:
         return True
-    # Autopilots use no altitudes of a fence, so their reference does not matter.
+    # Autopilots do not use the altitudes in a fence, so the altitude reference of the frame does not matter.
     if expected.command in FENCE_COMMANDS and {expected.frame, actual.frame} <= GLOBAL_FRAMES:
         return True
     # ArduPilot returns the frame GLOBAL for items without a place, and for the frame MISSION.

@@ -182,9 +182,9 @@ class MissionItem(Snapshot):
 
     ``command`` is a MAV_CMD, ``frame`` a MAV_FRAME. ``param1`` to ``param4`` belong to the command; NaN means "not
     given" where the standard allows it. ``x`` and ``y`` are integers as in MISSION_ITEM_INT: latitude and longitude in
-    1e-7 degrees in a global frame, or 1e-4 m in a local frame. For commands without a place they are the unscaled
-    parameters 5 and 6; fractions of these can only be sent as MISSION_ITEM. ``z`` is in metres, from the reference of
-    the frame; for commands without a place it is parameter 7.
+    1e-7 degrees in a global frame, or 1e-4 m in a local frame. ``z`` is in metres, from the reference of the frame. For
+    commands without a place, ``x``, ``y`` and ``z`` are parameters 5, 6 and 7, unscaled. Only MISSION_ITEM can carry an
+    ``x`` or ``y`` with a fraction.
 
     Values are not checked on construction, because vehicles and files may contain anything; the method ``check`` of the
     plan checks them. Items are equal if all their fields are equal; NaN equals NaN.
@@ -256,11 +256,10 @@ def place_item(
     *parameters: float,
     is_needed: bool = False,
 ) -> MissionItem:
-    """Create an item at a place.
+    """Create an item at a place, or at 0°, 0° without a place, which ArduPilot takes for the current position.
 
-    Exactly one of the three ``altitudes`` must be given: above home, above mean sea level or above the terrain. A
-    Position may supply it. Without a place, the item has 0°, 0°, which ArduPilot takes for the current position. With
-    ``is_needed``, a missing place raises InvalidArgument.
+    Exactly one of the three ``altitudes`` must be given (above home, above mean sea level, above the terrain), unless
+    the place is a Position with an altitude. With ``is_needed``, a missing place raises InvalidArgument.
     """
     if isinstance(latitude_deg, (Position, Home)):
         if longitude_deg is not None:

@@ -46,10 +46,12 @@ class _ItemSequence(Snapshot):
     def check(self, *, home_is_item_0: bool | None = None) -> None:
         """Check that all items can be sent.
 
-        NaN is accepted where the standard defines it as "not given": headings and reserved parameters. If you know the
-        autopilot, pass ``home_is_item_0`` to check more. True is for missions of ArduPilot: home takes the place of one
-        item, so 65,534 others are allowed. False is for other autopilots: a destination at 0°, 0° is refused, because
-        only ArduPilot takes it for the current position.
+        NaN is accepted where the standard defines it as "not given": headings and reserved parameters.
+
+        Args:
+            home_is_item_0: checks more for a known autopilot. True, for missions of ArduPilot: at most 65,534 items,
+                because home takes the place of one. False, for other autopilots: no destination at 0°, 0°, which only
+                ArduPilot takes for the current position.
 
         Raises:
             InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.
@@ -281,7 +283,11 @@ class RallyPoints(_ItemSequence):
         return tuple(item.position for item in self.items if item.position is not None)
 
     def check(self, *, home_is_item_0: bool | None = None) -> None:
-        """Raise :class:`InvalidArgument` if the points cannot be sent; the text has item, field and allowed values."""
+        """Check that all rally points can be sent. ``home_is_item_0`` has no effect.
+
+        Raises:
+            InvalidArgument: a point cannot be sent; the text names item, field, value and the allowed values.
+        """
         super().check()
 
     def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:

@@ -164,7 +164,7 @@ def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     yield _missing_in("rallyPoints", rally, "version")
 
 
-# These three functions ignore values of an unexpected type. Reading such a value raises an error about it later.
+# The following three functions skip values of an unexpected type. The functions that read the plan raise the error.
 
 
 def _member(value: Any, key: str) -> Any:
@@ -261,7 +261,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    """Return None if a coordinate is null. ``altitude`` is "amsl" or "relative"."""
+    """Read a place; return None if a coordinate is null. ``altitude`` is "amsl" or "relative"."""
     latitude_value, longitude_value, *altitude_values = value.elements(2, 3)
     latitude = latitude_value.number(-90, 90, null=True)
     longitude = longitude_value.number(-180, 180, null=True)

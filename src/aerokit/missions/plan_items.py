@@ -113,9 +113,9 @@ def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
 def merged_entries(
     entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
 ) -> list[Any]:
-    """Return entries for ``items``. Old entries at both ends are kept if their items are unchanged.
+    """Return the entries of ``mission.items`` in a .plan file for ``items``.
 
-    ``groups`` has the items of each old entry.
+    Old ``entries`` at the beginning and at the end are kept if their items (``groups``) are unchanged.
     """
     targets = {item.param1 for item in items if item.command == MavCmd.DO_JUMP}
 
@@ -191,8 +191,8 @@ def _jump_ids(
 ) -> dict[int, int]:
     """Map each doJumpId in a .plan file to the index of the mission item that has this id.
 
-    ``groups`` has the simple items of each entry (None for a landing pattern), ``sizes`` the number of mission items
-    that the entry becomes.
+    For each entry, ``groups`` has its simple items (None for a landing pattern), and ``sizes`` its number of mission
+    items.
     """
     ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}

@@ -109,9 +109,9 @@ def unscaled_xy(item: MissionItem) -> tuple[float, float]:
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Convert one coordinate to ``x`` or ``y``. This is the inverse of :func:`unscaled_xy`.
+    """Convert degrees, metres of a local frame, or an unscaled parameter, to ``x`` or ``y``.
 
-    Positions are rounded to integers. Other values keep their fraction.
+    This is the inverse of :func:`unscaled_xy`. Only unscaled parameters can have a fraction afterwards.
     """
     if math.isnan(value):
         return DEFAULT_XY
@@ -212,12 +212,11 @@ def pack_items(
 ) -> bytes:
     """Encode items (with the vehicle's numbering) as a packed plan.
 
-    ArduPilot processes a file when it is closed. A whole plan has ``first`` 0 and no options. ArduPilot then clears the
-    old mission first. If it refuses an item, the new mission consists of the items before that item.
+    A whole plan has ``first`` 0 and no options. When the file is closed, ArduPilot deletes the old items and stores the
+    new ones, up to the first item that it refuses.
 
-    With the option :data:`NO_CLEAR`, which ArduPilot accepts only for missions, the file replaces or appends items from
-    index ``first`` on, and all other items are kept. In such a file, jump targets must be below the number of items in
-    the file (ArduPilot 4.7).
+    The option :data:`NO_CLEAR` is for missions only. The file then replaces or appends items from index ``first`` on,
+    and ArduPilot keeps all other items. Jump targets must be below the number of items in the file (ArduPilot 4.7).
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

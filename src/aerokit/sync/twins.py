@@ -471,8 +471,8 @@ class SetpointStream(StreamTwin[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
-    any way, or a stop of the stream, orders the vehicle to hold. Exception: after a newer order, or a takeover by a
-    pilot or a failsafe, the stream sends nothing more.
+    any way, or a stop of the stream, orders the vehicle to hold. After a newer order, or a takeover by a pilot or a
+    failsafe, the stream sends nothing more, not even the hold.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
     ``max_lag_s``. It stops if the vehicle leaves the mode, disarms or falls silent. It also stops if the vehicle hits
@@ -627,12 +627,11 @@ class Guided(TwinOf["AsyncGuided"]):
         valid_for_s: float = 0.1,
         max_lag_s: float = 0.1,
     ) -> SetpointStream[AttitudeRateSetpoint]:
-        """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
+        """Stream body rates with thrust to ArduCopter or PX4 (SET_ATTITUDE_TARGET without an attitude).
 
-        Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
-
-        ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
-        set-point. Without a new one for ``valid_for_s``, aerokit orders a hold.
+        Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`. The
+        autopilot does not level the vehicle: it keeps turning at these rates until the next set-point. Without a new
+        set-point for ``valid_for_s``, aerokit orders a hold.
         """
         return SetpointStream(
             self._loop,
@@ -690,13 +689,13 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. Exception: after a newer
-    order, or a takeover by a pilot or a failsafe, the stream sends nothing more.
+    OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. After a newer order, or a
+    takeover by a pilot or a failsafe, the stream sends nothing more, not even the hold.
 
-    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but the vehicle may stay in place. It
-    also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or raises,
-    or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or else the
-    end of the block, raises :class:`SetpointStreamStopped`.
+    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but not because the vehicle does not
+    move. It also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or
+    raises, or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or
+    else the end of the block, raises :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.
@@ -733,7 +732,7 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
 class StickStream(BlockTwin["AsyncStickStream"]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
-    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block, also
+    Entering the block sends the initial positions for a second and then changes the mode. Leaving the block, also
     by an exception, orders the vehicle to hold, except after a newer order or a takeover. ArduPilot is also told to
     release the sticks. If the stream stops by itself (no new positions, a blocked event loop, a silent vehicle,
     another mode), the next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
@@ -3397,8 +3396,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
         """Wait until the camera is found and has identified itself.
 
-        All other calls first wait until the camera is found. They also need its identification, unless it is attached
-        to the autopilot.
+        Every other call to the camera first waits in the same way, but does not require a camera that is attached to
+        the autopilot to identify itself.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -3448,11 +3447,10 @@ class Camera(TwinOf["AsyncCamera"]):
         return self._loop.call(self.aio.captures)
 
     def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """Request missing captures, and return all captures in the camera's log.
+        """Return the captures in the camera's log, also those from before this program started.
 
-        These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
-        three successive captures that the camera does not send.
+        Missing captures are requested, the newest first, until the camera does not send three in succession. At most
+        the newest 20,000 are returned; a camera attached to the autopilot has only its newest capture.
 
         Args:
             timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
@@ -4136,8 +4134,8 @@ class Vehicle(VehicleTwin):
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time.
                 None: 3 for a request for data, 0 for all other commands, because a retry after a lost ack would execute
-                the command twice. A command that is not a request for data is sent again only right after a HEARTBEAT,
-                and only if the mode has not changed, no failsafe is active and there is no newer order
+                the command twice. If you allow retries for such a command, it is sent again only right after a
+                HEARTBEAT, and only if the mode has not changed, no failsafe is active and there is no newer order
                 (docs/reliability.md).
             attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
                 trips if necessary. None: 1, or 4 if the command is sent only once.
@@ -4203,8 +4201,9 @@ class Vehicle(VehicleTwin):
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
         If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
-        as :meth:`command` does. A set-point does not end the action in progress, but it ends orders about motion that
-        :meth:`posted` has opened. A message to another system ends nothing.
+        as :meth:`command` does. A set-point, a guided mission item or MISSION_SET_CURRENT does not end the action in
+        progress, but it ends orders about motion that :meth:`posted` has opened. A message to another system ends
+        nothing.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -4213,7 +4212,10 @@ class Vehicle(VehicleTwin):
         self._loop.call(self.aio.send, message)
 
     def note_sent(self, message: Message) -> None:
-        """Treat a message that the program sent by ``connection.send`` as if :meth:`send` had sent it."""
+        """Tell aerokit about a message that you sent by ``connection.send``, because it may replace earlier orders.
+
+        :meth:`send` does this itself.
+        """
         self._loop.call(self.aio.note_sent, message)
 
     def posted(
@@ -4889,14 +4891,15 @@ class Vehicle(VehicleTwin):
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
         order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
-        next heartbeat. Sends MAV_CMD_DO_REPOSITION
-        (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support this command.
+        next heartbeat.
+
+        Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or
+        SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, only the
-                altitude above home is used, and it counts from the home of this vehicle. A position of another vehicle
-                may count from another home. Without an altitude, or if the target is ``vehicle.home.value``, the
+            target: latitude and longitude, and an altitude above the home of this vehicle or above mean sea level. If
+                it has both, the altitude above home is used. Caution: the position of another vehicle has an altitude
+                above the home of that vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the
                 present altitude is kept.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
@@ -4957,8 +4960,8 @@ class Vehicle(VehicleTwin):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left. The vehicle turns the shorter way. Exception: for a relative angle of 170 to 350 degrees,
-                ArduPilot turns right if the angle is positive, and left if it is negative.
+                left. The vehicle turns the shorter way, but ArduPilot turns relative angles of ±170 to ±350 degrees in
+                the direction of their sign.
             relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.

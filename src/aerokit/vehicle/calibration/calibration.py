@@ -189,10 +189,10 @@ class CalibrationControl:
         command_param: int = 0,
         param_value: float = 1,
     ) -> Calibration:
-        """Return the iterator of a calibration. Nothing is sent before its first step.
+        """Return a calibration that has not started yet.
 
-        Parameter number ``command_param`` of MAV_CMD_PREFLIGHT_CALIBRATION is ``param_value``. The parameters before it
-        are 0. If ``command_param`` is 0, the procedure gets no parameters.
+        ``command_param`` is the number, from 1, of the MAV_CMD_PREFLIGHT_CALIBRATION parameter that becomes
+        ``param_value``. 0: the procedure needs no parameters.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"

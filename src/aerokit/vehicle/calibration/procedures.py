@@ -51,8 +51,8 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    # Time at which CALIBRATING was last seen as the latest state. It is infinite until the first report, so that
-    # `has_ended_silently` returns False.
+    # Time of the last check that found the state CALIBRATING. Infinite until then, so that `has_ended_silently` returns
+    # False.
     calibrating_at = math.inf
     with ExitStack() as cleanup:
 
@@ -265,7 +265,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 remaining = tuple(POSES.values())[request - 1 :]  # POSES has the order of ArduPilot's requests.
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
                 yield run.new_step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
-                await run.wait(lambda: run.context.arbiter.is_state_recent)  # Send nothing into a silence.
+                await run.wait(lambda: run.context.arbiter.is_state_recent)  # Do not send to a silent vehicle.
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed_pose, confirmed_at = request, now()
                 # ArduPilot has repeated its request until it received the confirmation. The repetitions are obsolete.

@@ -91,7 +91,7 @@ class CalibrationRun:
         calibration is in progress.
         """
         self.check_ready()
-        # The run of a deleted iterator is abandoned only in the next iteration of the event loop, so wait for that.
+        # A deleted `Calibration` abandons its run in the next iteration of the event loop, so wait for that.
         await anyio.lowlevel.checkpoint()
         while self._runs:  # Another call may have begun a calibration during the wait.
             run = self._runs[0]
@@ -128,7 +128,7 @@ class CalibrationRun:
         """Record that the vehicle has ended the calibration."""
         if not self._ended.is_set():
             self._ended.set()
-            self._cleanup.close()  # This also withdraws the cancel command, if one was sent: it need not be repeated.
+            self._cleanup.close()  # If a cancel command was sent, it is not sent again after this.
             if self in self._runs:
                 self._runs.remove(self)
 

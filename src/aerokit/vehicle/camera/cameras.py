@@ -62,8 +62,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
         """Wait until the camera is found and has identified itself.
 
-        All other calls first wait until the camera is found. They also need its identification, unless it is attached
-        to the autopilot.
+        Every other call to the camera first waits in the same way, but does not require a camera that is attached to
+        the autopilot to identify itself.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -73,7 +73,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         information: CameraInformation | None = None
         with anyio.move_on_after(timeout) as scope:
             information = await self._link.identify()
-        if information is None:  # Without a time-out, this is the answer of an autopilot that has no information.
+        if information is None:  # After the time-out, or because an autopilot has no information about its camera.
             limit = f" within {timeout:g} s" if scope.cancelled_caught else ""
             raise self._link.timeout_error(f"did not identify itself{limit}")
         return information
@@ -122,11 +122,10 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         return self._log.captures()
 
     async def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """Request missing captures, and return all captures in the camera's log.
+        """Return the captures in the camera's log, also those from before this program started.
 
-        These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
-        three successive captures that the camera does not send.
+        Missing captures are requested, the newest first, until the camera does not send three in succession. At most
+        the newest 20,000 are returned; a camera attached to the autopilot has only its newest capture.
 
         Args:
             timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
@@ -199,7 +198,7 @@ class Cameras:
         self._early_captures: list[tuple[Any, Capture]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
-        # True once `first` has returned `_first`. From then on, `first` always returns this object.
+        # True once the program has got `_first`; the property `first` then never returns another object.
         self._is_first_in_use = False
         session.register_cell(self.cell)
         bus = session.connection.bus

@@ -128,7 +128,7 @@ class CaptureLog:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None  # PX4's trigger cannot send a capture again.
-        self._requested.append(index)  # The answer may have a low index, which must not count as a reset.
+        self._requested.append(index)  # A low index in the answer does not mean that the camera counts from 0 again.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index):
@@ -241,8 +241,8 @@ class CaptureLog:
             # A CAMERA_CAPTURE_STATUS that was sent before this picture does not include it. This time stamp makes
             # `_on_status` ignore such a status.
             self._count_boot_ms = message.time_boot_ms
-        # Indices begin at 0, so `index` pictures came before this one. The camera may not have counted this one yet. If
-        # the index is far above the count, the camera does not count as the standard says.
+        # Indices begin at 0, so the camera has counted at least `index` pictures, perhaps without this one. An index
+        # far above the count is ignored, because such a camera does not number pictures as the standard says.
         if self._has_nonzero_count and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)
@@ -279,7 +279,8 @@ class CaptureLog:
         for callback in tuple(self.on_capture):
             callback(capture)
         is_older = self._highest is not None and capture.index < self._highest.capture.index
-        if not is_older or capture.success is False:  # An older capture was requested, or arrived late.
+        # An older capture that did not fail is not the latest: it was requested, or arrived late.
+        if not is_older or capture.success is False:
             self._link.set_cell(self.cell, capture, message)
         if is_new:
             self._link.publish(

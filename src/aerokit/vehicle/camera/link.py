@@ -38,9 +38,10 @@ MAX_SILENCE_S = 5.0
 
 
 class CameraLink(CameraOrders):
-    """One camera, addressed by component id, and by device id if it is attached to the autopilot.
+    """Sends commands to one camera and receives its messages.
 
-    ``number`` is one of these ids. Without it, the link binds to the first camera that is found.
+    ``number`` is 1 to 6 for a camera attached to the autopilot, otherwise its component id. None: the first camera that
+    is found.
     """
 
     def __init__(
@@ -73,8 +74,7 @@ class CameraLink(CameraOrders):
         self._is_bound = anyio.Event()
         # Time of the camera's last HEARTBEAT.
         self._heartbeat_at = -math.inf
-        # True after a silence of an identified camera until it has identified itself again, because another camera may
-        # use its id now.
+        # True if an identified camera was silent and must identify itself again: another camera may now use its id.
         self._must_identify_again = False
         self._session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")
@@ -318,7 +318,7 @@ class ActiveOperation:
                 self.discard()
             else:  # The camera may have started nevertheless.
                 self.order.commit()
-                # Raise the error without delay: the stop command is sent at once, and retried in the background.
+                # Do not wait for the answer to the stop command, so that the error is raised without delay.
                 await self.stop(is_awaited=False)
             raise
         self.order.commit()

@@ -40,8 +40,8 @@ MAX_ORDER_ATTEMPTS = 8
 class _ResendGuard:
     """Decides whether a command to a camera may be sent again.
 
-    A camera with its own component id must have sent a message since the command, because the autopilot's HEARTBEAT
-    does not show that the camera is present.
+    For a camera with its own component id, the camera's HEARTBEAT counts instead of the autopilot's, which does not
+    show that the camera is present.
     """
 
     def __init__(self, link: CameraOrders, sent: SentCommand) -> None:
@@ -252,9 +252,9 @@ DOUBTFUL_POLL_INTERVAL_S = 60.0
 
 
 class _PolledCell:
-    """The ``Feed`` of a state value whose message is requested while the program reads or watches the value.
+    """Tells when to request the message of a state value: while the program reads or watches the value.
 
-    The state value calls `pending`, `catch_up` and `watchers_changed` of its feed.
+    The state value calls `pending`, `catch_up` and `watchers_changed`, which belong to the protocol `Feed`.
     """
 
     def __init__(
@@ -265,10 +265,11 @@ class _PolledCell:
         # Times at which the program last used the value, and at which the message was last requested.
         self.read_at = -math.inf
         self.requested_at = -math.inf
-        # Set by the camera's answer to the last request; see UNSUPPORTED and MAYBE_UNSUPPORTED.
+        # True if the camera does not support the message, so that it is not requested before the next reboot.
         self.is_refused = False
+        # True if the camera may not support the message, so that it is requested rarely.
         self.is_doubtful = False
-        cell._feed_from(self)  # From now on, the state value uses this object as its `Feed`.
+        cell._feed_from(self)
 
     @property
     def pending(self) -> bool:

@@ -214,8 +214,7 @@ class PhotoInterval:
         self._new_captures = CaptureQueue(self._log)
         # Index of the capture to deliver next.
         self._next_index: int | None = None
-        # `reset_at` of the log when `_next_index` was determined. After a newer reset, the camera counts from 0 again,
-        # so that `_next_index` is no longer valid.
+        # The log's last reset for which `_next_index` is valid. After a newer reset, the camera counts from 0 again.
         self._known_reset_at = self._log.reset_at
         # The last capture, if it may be the first one after a reset; see `_first_after_reset`.
         self._possible_first: Capture | None = None
@@ -327,12 +326,12 @@ class PhotoInterval:
                 self._is_start_guessed = False
                 self._set_newest(first.index)
                 self._waiting = {first.index: first}
-            # Without a status, the first capture determines the start. A later capture with a much lower index shows
-            # that the first index was corrupt, and then determines the start instead.
+            # Without a status, the index of the first capture counts as the start of the series. A later capture with a
+            # much lower index shows that this index was corrupt, and counts as the start instead.
             if self._next_index is None or self._contradicts_guess(capture.index):
                 self._is_start_guessed = self._next_index is None  # A corrected start is not corrected again.
                 self._next_index = capture.index
-                self._waiting.clear()  # It may have the capture with the corrupt index.
+                self._waiting.clear()  # It may contain the capture with the corrupt index.
                 # One less than the index of this capture, so that the comparison at the end of the loop accepts it.
                 self._newest_index = capture.index - 1
             if not self._is_plausible(capture.index):
@@ -390,10 +389,10 @@ class PhotoInterval:
             self._next_index = following_index
 
     async def _check_silence(self, silent_checks: int) -> None:
-        """Ask the camera why no capture has arrived, and request the next capture if its report was lost.
+        """Request the camera's status, and the next capture if the status shows that it was taken.
 
-        Raises OperationRejected if the camera has ended the series, and OperationTimeout at the last of
-        ``MAX_SILENT_CHECKS`` checks.
+        Raises OperationRejected if the camera has ended the series, and OperationTimeout after ``MAX_SILENT_CHECKS``
+        checks without a capture.
         """
         status = await self._shutter.request_status(2.0 * CHECK_INTERVAL_S)
         self._collect()

@@ -205,7 +205,8 @@ class VideoMixin(CameraMixin):
         """
         check_range("stream", stream, 1, 255)
         streams = await self.load_streams()
-        if any(camera_stream.number == stream for camera_stream in streams):  # Otherwise the camera refuses the start.
+        # If the camera has no such stream, the others continue, and the camera refuses the command below.
+        if any(camera_stream.number == stream for camera_stream in streams):
             for camera_stream in streams:
                 if camera_stream.number != stream and camera_stream.is_running:
                     await self.stop_streaming(camera_stream.number)

@@ -51,7 +51,8 @@ class CommandArbiter:
 
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
-        self.slept_since: Callable[[float], float] = lambda _: 0.0  # see `Connection._slept_since`
+        # Returns for how many seconds since the given time the computer was suspended.
+        self.slept_since: Callable[[float], float] = lambda _: 0.0
         self.newest: Order | None = None
         """The last steering order given by an action or a raw command."""
         self.arm_commands_sent: int = 0
@@ -65,14 +66,14 @@ class CommandArbiter:
         self.last_disarmed_report_at: float = -math.inf
         """Time of the last HEARTBEAT that reported disarmed."""
         self._last_arming_at = -math.inf  # time of the last change from disarmed to armed
-        # The order of this program that caused this change; None if another party armed the vehicle.
+        # An order that stands for the last arming; None if another party armed the vehicle.
         self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
-        # (time, mode) of modes that HEARTBEAT may still report: those of orders that were replaced or whose block was
-        # left, and of the end of a mission.
+        # (time, mode) of each mode that HEARTBEAT may still report: the modes of orders that were replaced or whose
+        # block was left, and the mode after a mission.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
@@ -145,7 +146,7 @@ class CommandArbiter:
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        self._orders = [order]  # The order has ended all other actions, so they need no more reports of the vehicle.
+        self._orders = [order]  # All other actions have ended, so HEARTBEATs no longer update them.
         return order
 
     def raw_order(self, subjects: Collection[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
@@ -201,8 +202,8 @@ class CommandArbiter:
     ) -> Iterator[Order]:
         """Create a posted order, which is valid during the `with` block.
 
-        The new order ends earlier posted orders whose first subject is in ``subjects``. A later order about the first
-        of ``subjects`` ends the new order. If the first is "mode" or "motion", the new order also ends the action in
+        The order is about the first of ``subjects``; a later order about the same subject ends it. The order itself
+        ends earlier posted orders about any of ``subjects``. An order about "mode" or "motion" also ends the action in
         progress.
         """
         first_subject = subjects[0]
@@ -257,7 +258,7 @@ class CommandArbiter:
             is_done=is_done,
             slept_s=partial(self.slept_since, self._now()),
         )
-        if order.armed is None and armed is not None:  # A posted order to arm has already ended earlier orders to arm.
+        if order.armed is None and armed is not None:  # For a posted order, `post` has ended earlier ones.
             self._supersede_arming(armed)
             order.arm_command = self.arm_commands_sent
         self._sent.append(sent)
@@ -265,7 +266,7 @@ class CommandArbiter:
         try:
             yield sent
             # The block has not raised, so the vehicle has accepted the command.
-            order.was_refused = False  # An older command may replace one that the firmware does not support.
+            order.was_refused = False  # This command may replace one that was refused as unsupported.
             self._record_accepted(armed)
         except CommandRejected:
             order.was_refused = True
@@ -310,9 +311,8 @@ class CommandArbiter:
 
     @property
     def current(self) -> Order | None:
-        """The program's present order: the newest steering order, or the order that armed the vehicle."""
+        """The newest steering order since the vehicle armed; if there is none, the order that armed the vehicle."""
         newest = self.newest
-        # A steering order that was given before the vehicle armed belongs to an earlier flight.
         return newest if newest is not None and newest.given_at >= self._last_arming_at else self._arming_order
 
     def clear_failsafe(self) -> None:
@@ -324,8 +324,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        # After an order without modes, such as a raw command, a mode change does not prove a takeover. If `order` is
-        # not the newest one, the vehicle may execute a posted order that followed.
+        # For an order without modes, a takeover is not certain: a raw command may itself have changed the mode. It is
+        # not certain either if a posted order is newer, because the vehicle may be executing that order.
         was_taken_over = order is not None and bool(order.modes) and bool(order.takeover_reason) and order.is_newest
         # Disarming clears `topics`. A takeover does not undo an order to arm.
         return "arm" in topics if was_taken_over else bool(topics)
@@ -348,9 +348,10 @@ class CommandArbiter:
 
     @contextmanager
     def changing_mode(self) -> Iterator[None]:
-        """Keep the reported mode in doubt during a `with` block in which a command changes the mode.
+        """Distrust the reported mode during a `with` block in which a command changes the mode.
 
-        If the block is cancelled or times out, the doubt remains until a later change is confirmed.
+        If the block raises another error than CommandRejected, or is cancelled, the mode stays distrusted until a later
+        change is confirmed.
         """
         change = next(self._order_numbers)
         self._open_mode_changes += 1  # Blocks may overlap, because a new order may be given during a block.
@@ -476,7 +477,7 @@ class CommandArbiter:
         was_armed_by_program = is_order_open or was_caused_by_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        # This order is never sent: it records the arming, so that a later takeover or failsafe is noticed.
+        # This order is never sent. It records a takeover or a failsafe after the arming.
         self._arming_order = self._create_order(modes, ()) if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:

@@ -196,8 +196,8 @@ class ArmingActions(VehicleBase):
                 may_change_mode
                 and not has_computer_slept
                 and is_newest_order
-                # A set-point stream needs the mode that it has set, and the mode of an armed vehicle belongs to
-                # whoever has armed it.
+                # A set-point stream needs the mode that it has set. If another party has armed the vehicle meanwhile,
+                # the mode is not changed either.
                 and self._flight_cleanup.stop_stream is None
                 and self.telemetry.is_confirmed_disarmed
                 and self._is_in_mode_armable_by_option()
@@ -350,8 +350,7 @@ class ArmingActions(VehicleBase):
         if not force:
             self._session.check_disarmed("reboot")
         reboots_before = self._session.watch.reboots
-        # A reboot is recognised by a shorter time since boot, so the present time since boot is requested. Without an
-        # answer, the time since boot that was received last counts.
+        # A reboot is detected by a time since boot that is shorter than before, so request the present one.
         self._session.link_watch.request_time()
         unanswered: CommandTimeout | None = None
         with self._session.watch.expecting_reboot():
@@ -387,7 +386,7 @@ class ArmingActions(VehicleBase):
             now = self.connection.now()
             if now >= next_request_at:
                 self._session.link_watch.request_time()
-                # A reboot shows only while the time since boot is shorter than before. In a fast simulation, that is
-                # not for long, so the requests are frequent at first.
+                # A reboot is detected by a time since boot that is shorter than before. A fast simulation soon exceeds
+                # the old time, so the requests are frequent at first.
                 next_request_at = now + POLL_INTERVAL_S + (now - started) / 10
             await anyio.sleep(POLL_INTERVAL_S)

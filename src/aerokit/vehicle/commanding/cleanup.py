@@ -31,9 +31,8 @@ logger: logging.Logger = logging.getLogger("aerokit")
 class BackgroundTask:
     """Runs one background task for a vehicle. A new task replaces the previous one.
 
-    At the end of the vehicle's `async with` block, aerokit waits briefly for the task. If the task is not done by then,
-    aerokit logs the warning "the async with block of this vehicle was left …", which ``warning_clause`` completes.
-    ``name`` is the task's name.
+    ``name`` is the task's name. If the task is not done at the end of the vehicle's `async with` block, aerokit logs
+    "the async with block of this vehicle was left", followed by ``warning_clause``.
     """
 
     def __init__(self, session: VehicleSession, name: str, warning_clause: str) -> None:
@@ -99,8 +98,8 @@ HOLD_CLOSE_TIMEOUT_S = 1.5
 # Maximum number of attempts to hold a vehicle that was silent. The first attempt follows when the silence ends.
 MAX_HOLD_ATTEMPTS = 3
 
-# A hold that was sent without waiting is repeated if it is not acknowledged within this many seconds, and at most this
-# many times.
+# A hold that was sent without waiting is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most
+# MAX_HOLD_RESENDS times.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
 # NaN means the present position, so the vehicle brakes and does not fly back to a point that it has passed.
@@ -116,7 +115,7 @@ class FlightCleanup:
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender
         self.stop_stream: Callable[[str], None] | None = None
-        # The order that a call awaits in `flying`.
+        # The order whose effect a call waits for.
         self._awaited_order: Order | None = None
         self._task = BackgroundTask(session, "aerokit hold", warning_clause="before a hold was confirmed")
         # A new steering order makes the confirmation of an earlier hold pointless.
@@ -239,10 +238,11 @@ class FlightCleanup:
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Create an order to change to ``mode``. The caller prepares a stream in the block, and then sends the order.
 
-        The end of the block raises OperationRejected if the order has ended, and HeartbeatTimeout if the vehicle is
-        silent. After these errors and those of the block, the caller must not send the order. A hold is then ordered,
-        because an earlier order may still move the vehicle (see `hold_in_background`). Raises BusyError if another
-        stream is open.
+        Raises BusyError if another stream is open. The end of the block raises OperationRejected if the order has
+        ended, and HeartbeatTimeout if the vehicle is silent.
+
+        If the block or its end raises, the caller must not send the order. aerokit then orders a hold, because an
+        earlier order may still move the vehicle (see `hold_in_background`).
         """
         self.check_no_stream()
         order = self._arbiter.order(mode)
@@ -287,7 +287,7 @@ class ArmCleanup:
         self._task = BackgroundTask(
             session, "aerokit late arming", warning_clause="while an arm command may still be executed"
         )
-        # The arm order that a call awaits in `arming`, and whether the vehicle was armed before it.
+        # The arm order whose effect a call waits for, and whether the vehicle was armed before it.
         self._awaited: tuple[Order, bool] | None = None
 
     @contextmanager
@@ -388,6 +388,6 @@ class ArmCleanup:
 
     async def finish(self) -> None:
         """Wait briefly for the outcome of an abandoned arm order. Logs a warning if it stays unknown."""
-        if self._awaited is not None:  # Another task still awaits this order. It counts as abandoned.
+        if self._awaited is not None:  # A task still waits for an arm order, which is now abandoned.
             self.watch(*self._awaited)
         await self._task.finish(ARM_CLOSE_TIMEOUT_S)

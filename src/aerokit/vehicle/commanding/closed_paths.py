@@ -16,7 +16,7 @@ MIN_SPEED_M_S = 0.1
 """Minimum speed while slowing down, so that the set-point reaches the end."""
 
 MIN_TOLERANCE_M, TOLERANCE_SHARE = 5.0, 0.3
-"""Tolerance to count a vehicle as on its circle: this fraction of the radius, and at least this many metres."""
+"""A vehicle is on its circle if it is nearer to it than TOLERANCE_SHARE of the radius, or than MIN_TOLERANCE_M."""
 
 Vector = tuple[float, float]
 """Metres north and east."""

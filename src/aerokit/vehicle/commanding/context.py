@@ -54,9 +54,10 @@ class VehicleContext:
         return once(partial(self.finish_callbacks.remove, callback))
 
     async def finish(self) -> bool:
-        """At the end of the vehicle's `async with` block, hold the vehicle if a flight was abandoned.
+        """Run the callbacks of `on_finish`, and hold the vehicle if a flight is unfinished.
 
-        Returns True if a hold was still to be confirmed when the block ended.
+        Called at the end of the vehicle's `async with` block. Returns True if it has ordered a hold, or if an earlier
+        hold was not confirmed yet.
         """
         # The newest first, as nested blocks end: a gimbal is stopped before its control is released.
         for callback in tuple(reversed(self.finish_callbacks)):

@@ -253,7 +253,7 @@ class FlightActions(VehicleBase):
         try:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
         except OperationRejected:
-            # PX4 changes to LOITER when it disarms after an earlier landing. The wait for the ground then succeeds.
+            # After a landing, PX4 disarms and changes to LOITER. The vehicle is then on the ground, as ordered.
             is_down = self.telemetry.is_confirmed_disarmed or is_reported_on_ground(self.telemetry)
             if not (is_down and order.is_newest):
                 raise

@@ -138,13 +138,13 @@ class FollowStream(SteeringStream[TargetState]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. Exception: after a newer
-    order, or a takeover by a pilot or a failsafe, the stream sends nothing more.
+    OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. After a newer order, or a
+    takeover by a pilot or a failsafe, the stream sends nothing more, not even the hold.
 
-    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but the vehicle may stay in place. It
-    also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or raises,
-    or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or else the
-    end of the block, raises :class:`SetpointStreamStopped`.
+    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but not because the vehicle does not
+    move. It also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or
+    raises, or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or
+    else the end of the block, raises :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.

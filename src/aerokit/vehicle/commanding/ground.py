@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.telemetry import Telemetry
 
 SETTLING_S, SETTLED_M_S = 0.5, 2.0
-"""A vehicle on the ground moves up or down slower than this speed for at least this time, even on a ship.
+"""A vehicle on the ground, even on a ship, moves up or down slower than SETTLED_M_S for at least SETTLING_S seconds.
 
-A vehicle whose motors stop while it climbs is slower than this speed for 0.4 s at most.
+A vehicle whose motors stop while it climbs is slower than SETTLED_M_S for 0.4 s at most.
 """
 
 STANDING_S, STANDING_M = 5.0, 2.0
-"""A vehicle whose height changes by less than this distance in this time is on the ground.
+"""A vehicle whose height changes by less than STANDING_M metres in STANDING_S seconds is on the ground.
 
 This applies whatever velocity the vehicle reports, because the velocity may be wrong.
 """
@@ -34,7 +34,10 @@ Autopilots descend at 5 m/s at most, and slow down before the touchdown.
 """
 
 IMPACT_STOP_S = 0.7
-"""A descent at ``IMPACT_M_S`` that ends within this time is an impact. Autopilots need longer to brake."""
+"""A vehicle that sinks at ``IMPACT_M_S`` and stops within this many seconds has hit the ground.
+
+Autopilots need longer to brake.
+"""
 
 MAX_INTERVAL_S = 3.5
 """After a longer interval between two velocities, nothing is known about what happened in between."""
@@ -49,9 +52,9 @@ IMPACT_HEIGHT_M = 3.0
 """If the height changes by this distance after a sudden stop, the stop was not on the ground."""
 
 MIN_DROP_M = 1.0
-"""A vehicle that falls until it sinks at ``IMPACT_M_S`` loses 1.8 m of height.
+"""A vehicle that has lost less height than this has not fallen: only its reported velocity has jumped.
 
-If it has lost less height than this constant, only its reported velocity has jumped.
+A vehicle that falls until it sinks at ``IMPACT_M_S`` loses 1.8 m of height.
 """
 
 MAX_SLIDE_M_S = 8.0
@@ -86,11 +89,11 @@ class ImpactDetector:
         velocity, updated_at = cell.latest, cell.updated_at
         if velocity is None or updated_at == self._updated_at:
             return
-        if updated_at < self._updated_at:  # The computer slept, so the last velocity got an earlier time.
+        if updated_at < self._updated_at:  # The computer slept; this makes all values older.
             self._updated_at, self._sank_fast_at = updated_at, -math.inf
             return
-        # An impact may be shorter than the interval between two received velocities. It then shows in two consecutive
-        # velocities, so these are compared even if the interval is long.
+        # An impact may be shorter than the interval between two velocities, so consecutive velocities are compared even
+        # if the interval is long.
         interval_s = min(updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = updated_at
@@ -106,7 +109,7 @@ class ImpactDetector:
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s = self._max_sink_m_s
-                # This height may be old. Without one, no later height could show that the vehicle flies on.
+                # Even an old height is needed, so that a later height can show that the vehicle flies on.
                 self._impact_height_m = height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.
@@ -133,7 +136,8 @@ class ImpactDetector:
 class GroundCheck:
     """Distinguishes a vehicle on the ground from one that falls, and a landing from a fall.
 
-    ArduCopter and PX4 report ON_GROUND whenever they are disarmed (AP_Arming_Copter.cpp, MulticopterLandDetector.cpp).
+    A report of ON_GROUND is not sufficient: ArduCopter and PX4 also send it when they were disarmed in the air
+    (AP_Arming_Copter.cpp, MulticopterLandDetector.cpp).
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -193,9 +197,8 @@ class GroundCheck:
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
-            # The reported velocity may be wrong. If the height has not changed for STANDING_S, the vehicle stands on
-            # the ground although it reports a velocity. `current_height` ignores old heights, because an outdated
-            # height would not change in a fall either.
+            # The reported velocity may be wrong: if the height has not changed for STANDING_S, the vehicle stands on
+            # the ground. `current_height` ignores old heights, which would not change in a fall either.
             height_m = self._impact.current_height()
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, STANDING_M)

@@ -41,8 +41,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# Some autopilots restart their path at each position set-point. A new set-point is sent this many times at the stream's
-# rate, because one may be lost, and then only at this interval in seconds.
+# For autopilots that restart their path at each position set-point: a new one is sent INITIAL_REPEATS times at the
+# stream's rate, because one may be lost, and then only every REPEAT_INTERVAL_S seconds.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
 # Set-points that the autopilot executes with its own limits of acceleration. With these, a sudden stop is an impact.
@@ -147,12 +147,11 @@ class Guided:
         valid_for_s: float = 0.1,
         max_lag_s: float = 0.1,
     ) -> SetpointStream[AttitudeRateSetpoint]:
-        """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
+        """Stream body rates with thrust to ArduCopter or PX4 (SET_ATTITUDE_TARGET without an attitude).
 
-        Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
-
-        ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
-        set-point. Without a new one for ``valid_for_s``, aerokit orders a hold.
+        Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`. The
+        autopilot does not level the vehicle: it keeps turning at these rates until the next set-point. Without a new
+        set-point for ``valid_for_s``, aerokit orders a hold.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
 
@@ -213,8 +212,8 @@ class SetpointStream(SteeringStream[SetpointT]):
     """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
     Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving the block in
-    any way, or a stop of the stream, orders the vehicle to hold. Exception: after a newer order, or a takeover by a
-    pilot or a failsafe, the stream sends nothing more.
+    any way, or a stop of the stream, orders the vehicle to hold. After a newer order, or a takeover by a pilot or a
+    failsafe, the stream sends nothing more, not even the hold.
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
     ``max_lag_s``. It stops if the vehicle leaves the mode, disarms or falls silent. It also stops if the vehicle hits
@@ -236,8 +235,8 @@ class SetpointStream(SteeringStream[SetpointT]):
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
-        # How many more times the set-point is sent at the stream's rate, and when it was last sent. Both matter only
-        # for autopilots that restart their path at each position set-point.
+        # For autopilots that restart their path at each position set-point: how many more times it is sent at the
+        # stream's rate, and when it was last sent.
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)

@@ -32,10 +32,7 @@ RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
 def in_order(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
-    """Return all reasons in the order in which aerokit lists them.
-
-    ``report_reasons`` name missing or old reports.
-    """
+    """Join the reasons in the order of an error text. ``report_reasons`` are those about missing or old reports."""
     first = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
     last = [reason for reason in report_reasons if reason not in first]
     return [*first, *other_reasons, *last]
@@ -127,7 +124,7 @@ class Health:
         return reasons
 
     def _unnamed_reasons(self) -> list[str]:
-        """Return low batteries, or a general text, for failing checks that the vehicle does not explain."""
+        """Return reasons for failing checks that the vehicle does not explain: low batteries, else a general text."""
         low_batteries = []  # PX4 sends its status text about a low battery only once.
         for battery in self._telemetry.batteries.latest or ():
             # With these charge states (critical, emergency, failed, unhealthy), vehicles refuse to arm.
@@ -168,7 +165,7 @@ class Health:
             await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= HEALTH_MAX_AGE_S)
 
     async def request_reasons(self, since: float) -> None:
-        """Request the reasons if pre-arm checks fail. Does nothing if some were received since ``since``."""
+        """If pre-arm checks fail, request the status texts about them, unless some arrived since ``since``."""
         sensors = self._telemetry.sensors.latest
         if sensors is not None and sensors.prearm_checks_pass is False and not self._telemetry.is_armed:
             await self._request_texts(since)
@@ -209,8 +206,7 @@ class Health:
 
     def _failing_sensors(self) -> list[str]:
         sensors = self._telemetry.sensors.latest
-        # In a mode that does not allow arming, PX4 reports what this mode requires. The report then does not show what
-        # arming in another mode requires.
+        # In a mode that does not allow arming, PX4 reports what this mode requires, and not what arming requires.
         is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is None or sensors.prearm_checks_pass is True or is_meaningless:
             return []

@@ -149,7 +149,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 @checks_arguments
 class MessagingActions(VehicleBase):
-    """Commands, messages, subscriptions, and information about the vehicle that is not in a cell."""
+    """Commands, messages, subscriptions, and descriptions of the vehicle."""
 
     # ---------------------------------------------------------------------------- commands
 
@@ -173,8 +173,8 @@ class MessagingActions(VehicleBase):
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time.
                 None: 3 for a request for data, 0 for all other commands, because a retry after a lost ack would execute
-                the command twice. A command that is not a request for data is sent again only right after a HEARTBEAT,
-                and only if the mode has not changed, no failsafe is active and there is no newer order
+                the command twice. If you allow retries for such a command, it is sent again only right after a
+                HEARTBEAT, and only if the mode has not changed, no failsafe is active and there is no newer order
                 (docs/reliability.md).
             attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
                 trips if necessary. None: 1, or 4 if the command is sent only once.
@@ -244,8 +244,9 @@ class MessagingActions(VehicleBase):
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
         If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
-        as :meth:`command` does. A set-point does not end the action in progress, but it ends orders about motion that
-        :meth:`posted` has opened. A message to another system ends nothing.
+        as :meth:`command` does. A set-point, a guided mission item or MISSION_SET_CURRENT does not end the action in
+        progress, but it ends orders about motion that :meth:`posted` has opened. A message to another system ends
+        nothing.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -255,8 +256,11 @@ class MessagingActions(VehicleBase):
         self.note_sent(message)
 
     def note_sent(self, message: Message) -> None:
-        """Treat a message that the program sent by ``connection.send`` as if :meth:`send` had sent it."""
-        target = getattr(message, "target_system", self.system_id)  # All messages with subjects have this field.
+        """Tell aerokit about a message that you sent by ``connection.send``, because it may replace earlier orders.
+
+        :meth:`send` does this itself.
+        """
+        target = getattr(message, "target_system", self.system_id)  # All steering messages have this field.
         subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
             self._arbiter.record_own_arming(message.param1 == 1)
@@ -269,7 +273,7 @@ class MessagingActions(VehicleBase):
             elif message.base_mode & CUSTOM_MODE_ENABLED:
                 modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
             self._arbiter.raw_order(subjects, modes=modes).was_sent = True
-        elif subjects:  # Any other message is a set-point, which ends posted orders, but not the action in progress.
+        elif subjects:  # Set-points and mission messages end posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
 
     @contextmanager

@@ -159,7 +159,7 @@ class Order:
         self.armed = armed
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
         self.may_move: bool = False
-        """True once the vehicle may move because of this or an earlier order; if abandoned, it must then hold."""
+        """True once the vehicle may move because of this or an earlier order. It must hold if this one is abandoned."""
         self.was_refused: bool = False
         """True if the vehicle refused the order, and therefore continues its previous task."""
         self.was_flown_before: bool = False
@@ -185,7 +185,7 @@ class Order:
         self.arm_command: int | None = None
         """Number of the order's arm or disarm command among those of the program; None until it was sent."""
         self.was_sent: bool = False
-        """True once the first transmission of a command of the order began. The next command is a further step."""
+        """True once the first transmission of the order's first command began."""
         self.only_stops: bool = False
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_closed: bool = False
@@ -237,7 +237,7 @@ class Order:
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """Make the device's previous order valid again, because this one was refused or not acknowledged."""
+        """Take this order back, for example after a refusal. The device's previous order becomes valid again."""
         self.is_withdrawn = True
 
     def commit(self) -> None:
@@ -269,8 +269,7 @@ class Order:
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
         elif is_expected and is_settled:
-            # An earlier order of the program has changed the mode. If the mode from before appears again, another party
-            # has set it.
+            # An earlier order of the program has changed the mode. If `mode_before` returns, another party has set it.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:

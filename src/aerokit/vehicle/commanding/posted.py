@@ -125,8 +125,8 @@ class PostedOrder:
                 may_retry = error.result == MavResult.TEMPORARILY_REJECTED and attempts_left and not self.end
                 if may_retry and await self._is_valid_at_next_heartbeat(timeout):
                     continue
-                # HEARTBEAT may have reported the effect before the refusal, or during the wait. The order may have
-                # other modes, too, so its effect alone does not show that this mode was accepted.
+                # Ignore the refusal if HEARTBEAT has reported an effect of the order, and reports this mode. The order
+                # may have other modes, too.
                 if not (self._order.is_confirmed and self._session.telemetry.is_in(mode)):
                     raise
             return

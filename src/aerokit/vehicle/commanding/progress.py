@@ -31,7 +31,7 @@ POSITION_MAX_AGE_S = 2.0
 """Maximum age in seconds of a position that counts as the vehicle's present position."""
 
 STALL_TIMEOUT_S, STALL_DISTANCE_M = 12.0, 0.3
-"""A vehicle that moves less than this distance within this time counts as not moving."""
+"""A vehicle that moves less than STALL_DISTANCE_M within STALL_TIMEOUT_S seconds counts as not moving."""
 
 FALL_SINK_M_S = 3.0
 """Speed from which a descent is considered a fall; autopilots descend at 1.5 m/s by default."""

@@ -27,12 +27,10 @@ if TYPE_CHECKING:
 
 # Seconds between computed set-points, rate in Hz at which the latest one is sent, and seconds for which it stays valid.
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
-RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
-"""Deviation in metres from which a reported radius counts as wrong.
-
-For CIRCLE_REPORT_S seconds after the command, PX4 may still report the previous circle, or send a text that refuses
-the ordered one.
-"""
+RADIUS_ERROR_M = 0.5
+"""Deviation in metres from which a reported radius counts as wrong."""
+CIRCLE_REPORT_S = 2.0
+"""Seconds after the command in which PX4 may still report the previous circle, or refuse the new one by a text."""
 LAG_ROUNDS = 0.02
 """Fraction of a round by which the count may lag although the vehicle is at the end of its path."""
 END_TIMEOUT_S = 15.0
@@ -42,10 +40,11 @@ FRAME_TIMEOUT_S = 5.0
 
 
 class RoundFlight:
-    """One flight to a place, and around it if there is a ``counter``.
+    """One flight to a place and, with a ``counter`` of rounds, around it.
 
-    With ``rounds=None``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s.
-    Error texts call the place ``center_name``. The constructor raises if the vehicle cannot fly there.
+    The flight ends after the given ``rounds``; None: it lasts until cancelled. ``limits`` are max_distance_m, timeout
+    and max_silence_s. ``center_name`` is the name of the place for error texts. The constructor checks the place, and
+    that the vehicle is flying.
     """
 
     def __init__(

@@ -51,12 +51,11 @@ class OrderSender:
         """Send one command of an order until it is acknowledged or its effect is reported.
 
         The effect is reported once the vehicle has changed to one of ``modes`` or to ``armed``, or ``is_done()``
-        returns True. If the order flies the vehicle, each of its commands but the first waits for a recent HEARTBEAT.
+        returns True. From the second command of a steering order on, :meth:`await_recent_state` is called first.
 
         Raises:
-            OperationRejected: the order was superseded or taken over, or the computer slept before a later command of
-                an order that flies the vehicle.
-            HeartbeatTimeout: the vehicle was silent before a later command of such an order.
+            OperationRejected: the order was superseded or taken over, or the computer slept.
+            HeartbeatTimeout: the vehicle was silent before a second or later command.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
@@ -98,7 +97,7 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for a recent HEARTBEAT before a further command of an order. Before the first, ``order`` is None.
+        """Wait for a recent HEARTBEAT before a command. ``order`` is None before the first command of an order.
 
         Raises OperationRejected if the order has ended or the computer slept, and HeartbeatTimeout if there is no
         HEARTBEAT for ``MAX_SILENCE_S``.
@@ -107,8 +106,8 @@ class OrderSender:
             self.raise_if_slept(order)
         if self._arbiter.is_state_recent:
             return
-        # After `MAX_SILENCE_S`, the command would be too late. This also applies if the event loop was blocked for so
-        # long, and HEARTBEATs are waiting to be read.
+        # After `MAX_SILENCE_S`, the command would be too late. If the event loop was blocked for that long, HEARTBEATs
+        # that wait to be read do not change this.
         with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)) as scope:
             await self._session.wait_for_heartbeat()
         if scope.cancelled_caught:
@@ -189,7 +188,7 @@ class OrderSender:
             )
         except CommandRejected as error:
             is_for_autopilot = component_id in (None, BROADCAST, self._session.component_id)
-            if error.result != MavResult.UNSUPPORTED or not is_for_autopilot:  # SET_MODE has no target component.
+            if error.result != MavResult.UNSUPPORTED or not is_for_autopilot:  # SET_MODE has no field for a component.
                 raise
             self.raise_if_ended(order)
             # Firmware that does not support the command gets one SET_MODE instead. While the vehicle is silent, a
@@ -238,9 +237,8 @@ class OrderSender:
     ) -> None:
         """Wait until HEARTBEAT reports the effect of an accepted command.
 
-        PX4 acknowledges some commands twice: the first ack is always ACCEPTED, the second may be a refusal.
-        ``refusals`` is a list to which such refusals are added; see ``VehicleSession.refusals_of``. ``operation`` is
-        the name for error texts.
+        ``operation`` is the name for error texts. ``refusals`` is the list of ``VehicleSession.refusals_of``. It is
+        needed because PX4 acknowledges some commands twice: first always with ACCEPTED, then perhaps with a refusal.
 
         Raises:
             CommandRejected: the vehicle first accepted and then refused the command.

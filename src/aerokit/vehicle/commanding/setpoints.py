@@ -53,7 +53,7 @@ ZERO = (0.0, 0.0, 0.0)
 # Bits of ATTITUDE_TARGET_TYPEMASK.
 IGNORE_BODY_RATES, IGNORE_ATTITUDE = 0x07, 0x80
 ACTUATORS_PER_GROUP, MAX_BODY_RATE_DEG_S = 8, 3600.0
-# A vehicle may stand still if its set-point is slower than this, or nearer than this many arrival radii.
+# A vehicle may stand still if its set-point is slower than SLOW_M_S, or nearer than MAX_RESTING_RADII arrival radii.
 SLOW_M_S, MAX_RESTING_RADII = 0.3, 2.0
 
 
@@ -205,10 +205,10 @@ class SetpointEncoder:
     def body_velocity(self, setpoint: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
-        For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the reported heading. In
-        MAV_FRAME_BODY_NED, ArduPilot treats yaw as a turn: ArduCopter adds it to its previous target heading, Rover to
-        its present heading. Turns computed from the reported heading would make the heading oscillate. Raises
-        StaleValueError if the reported heading is old, because the vehicle would move in a wrong direction.
+        In MAV_FRAME_BODY_NED, ArduPilot treats yaw as a turn from the previous target heading (ArduCopter) or from the
+        present heading (Rover). A set-point with a heading is therefore converted to MAV_FRAME_LOCAL_NED by the
+        reported heading. Raises StaleValueError if the reported heading is old, because the vehicle would then move in
+        a wrong direction.
         """
         forward, right, frame = setpoint.forward_m_s, setpoint.right_m_s, MavFrame.BODY_NED
         if setpoint.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:

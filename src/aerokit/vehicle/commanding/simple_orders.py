@@ -109,8 +109,9 @@ class SimpleOrder(Snapshot):
         Args:
             context: the vehicle.
             values: one for each `Argument`, in order; they are also passed to `Effect.is_reported`.
-            device_order: the order of which this command is a part. None: create one about ``topic``, if given.
-            topic: identifies the device, e.g. ``("relay", 3)``. A newer order with the same topic ends this call.
+            device_order: the order to which this command belongs, if the caller has already created it.
+            topic: the device, e.g. ``("relay", 3)``, if there is no ``device_order``. A newer order with the same
+                topic ends this call.
             component_id: the target component; None: the autopilot.
             timeout: seconds after the acknowledgement within which a message must report the effect.
 
@@ -145,8 +146,8 @@ class SimpleOrder(Snapshot):
     ) -> None:
         """Send the command and wait for a status text that reports its effect.
 
-        At each check, ``is_done(text, seconds_since_ack)`` is called for every text received so far. It may accept an
-        old text when enough time has passed since the acknowledgement. Only for orders without ``effect``.
+        ``is_done(text, seconds_since_ack)`` is called repeatedly for every text received so far, so it can accept a
+        text after some time. Only for orders without ``effect``.
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """

@@ -56,7 +56,7 @@ class StickInput(Snapshot):
 class StickStream(SteeringStream[StickInput]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
-    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block, also
+    Entering the block sends the initial positions for a second and then changes the mode. Leaving the block, also
     by an exception, orders the vehicle to hold, except after a newer order or a takeover. ArduPilot is also told to
     release the sticks. If the stream stops by itself (no new positions, a blocked event loop, a silent vehicle,
     another mode), the next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.

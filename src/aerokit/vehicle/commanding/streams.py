@@ -208,8 +208,8 @@ class ValueStream(Generic[ValueT]):
 class SteeringStream(ValueStream[ValueT]):
     """Flies the vehicle by values that the ``async with`` block supplies, in the flight mode for such values.
 
-    Entering the block changes to the mode. Leaving it in any way orders the vehicle to hold, except after a newer order
-    or a takeover. If the stream stops by itself, the next value, or else the end of the block, raises
+    Entering the block changes to this mode. Leaving the block in any way orders the vehicle to hold, except after a
+    newer order or a takeover. If the stream stops by itself, the next value, or else the end of the block, raises
     :class:`SetpointStreamStopped`.
     """
 

@@ -56,12 +56,12 @@ RESEND_INTERVAL_S = 1.0
 # The vehicle has arrived once it has been within the arrival radius for this many seconds.
 ARRIVED_FOR_S = 0.5
 
-# A direction is sent only for turns between these angles. ArduPilot measures the direction from its own target heading,
-# so near 0 and 360 degrees it might turn almost a full circle (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad). In between,
-# the shorter way might be the wrong one.
+# A direction is sent only for turns between these angles, for which the shorter way might be the wrong one. ArduPilot
+# measures the direction from its own target heading, so for other turns, a direction might cause almost a full circle
+# (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
 MIN_DIRECTED_TURN_DEG, MAX_DIRECTED_TURN_DEG = 170, 350
 
-# Seconds to wait for the acknowledgement of a turn with a direction, which is sent only once.
+# The command for a turn with a direction is sent only once, with this many seconds for its acknowledgement.
 DIRECTED_TURN_ACK_TIMEOUT_S = 4.0
 
 
@@ -84,14 +84,15 @@ class TravelActions(VehicleBase):
 
         After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
         order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
-        next heartbeat. Sends MAV_CMD_DO_REPOSITION
-        (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
-        vehicle that does not support this command.
+        next heartbeat.
+
+        Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or
+        SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, only the
-                altitude above home is used, and it counts from the home of this vehicle. A position of another vehicle
-                may count from another home. Without an altitude, or if the target is ``vehicle.home.value``, the
+            target: latitude and longitude, and an altitude above the home of this vehicle or above mean sea level. If
+                it has both, the altitude above home is used. Caution: the position of another vehicle has an altitude
+                above the home of that vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the
                 present altitude is kept.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
@@ -148,8 +149,8 @@ class TravelActions(VehicleBase):
             self._flight_cleanup.hold_in_background(order)
             raise
         except OperationRejected:
-            # The vehicle is on its way, but has refused the speed or the heading, or the computer slept before these
-            # were sent. After a takeover, nothing is sent.
+            # The vehicle is on its way, but the speed or the heading was refused or not sent. After a takeover,
+            # `hold_in_background` sends nothing.
             if is_incomplete:
                 self._flight_cleanup.hold_in_background(order)
             raise
@@ -174,7 +175,7 @@ class TravelActions(VehicleBase):
             if error.result != MavResult.UNSUPPORTED:
                 raise
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
-            self._sender.raise_if_ended(order)  # `await_recent_state` checks this only if it has to wait.
+            self._sender.raise_if_ended(order)  # `await_recent_state` does this only if it waits.
             await self._sender.await_recent_state(order)
             ignored = dict.fromkeys(("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate"), 0.0)
             message = SetPositionTargetGlobalInt(
@@ -268,8 +269,8 @@ class TravelActions(VehicleBase):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left. The vehicle turns the shorter way. Exception: for a relative angle of 170 to 350 degrees,
-                ArduPilot turns right if the angle is positive, and left if it is negative.
+                left. The vehicle turns the shorter way, but ArduPilot turns relative angles of ±170 to ±350 degrees in
+                the direction of their sign.
             relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
