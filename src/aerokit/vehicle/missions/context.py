@@ -295,6 +295,8 @@ class MissionTracker:
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
         if not is_armed and self._was_active and self.is_at_last_item and self.is_in_mission_mode:
             self._complete()
+        elif not is_armed and not self._was_active and self._session.connection.now() < self.stale_until:
+            self.stale_until = math.inf  # This flight has not begun, so it cannot be complete.
 
     def _on_reached(self, _: int | None, seq: int) -> None:
         now = self._session.connection.now()

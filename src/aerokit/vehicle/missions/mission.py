@@ -499,6 +499,8 @@ class MissionControl(VehiclePlan["Mission"]):
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         await self._order_mode(mode, order, timeout)
+        if order.end:  # The HEARTBEAT that reports the mode may also report that the vehicle has disarmed.
+            raise OperationRejected(f"the mission was not started: {order.end}")
         if self._session.telemetry.is_in(mode):
             self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
 
