@@ -248,9 +248,10 @@ class FlightActions(VehicleBase):
         try:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
         except OperationRejected:
-            # PX4 changes to LOITER when it disarms after an earlier landing. The wait for the ground then succeeds.
+            # PX4 changes to LOITER when it disarms after an earlier landing, which ends the order. The wait for the
+            # ground then succeeds. A refusal does not end the order, so it is raised.
             is_down = self.telemetry.is_confirmed_disarmed or is_reported_on_ground(self.telemetry)
-            if not (is_down and order.is_newest):
+            if not (order.end and is_down and order.is_newest):
                 raise
 
     async def _await_ground(
