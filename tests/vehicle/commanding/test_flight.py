@@ -700,6 +700,13 @@ async def test_land_ends_when_a_pilot_takes_over(flying: Flight) -> None:
             await flying.vehicle.land()
 
 
+@pytest.mark.parametrize("operation", ["land", "return_to_launch"])
+async def test_refused_landing_of_disarmed_vehicle_raises(grounded: Flight, operation: str) -> None:
+    grounded.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.FAILED)
+    with pytest.raises(CommandRejected):
+        await getattr(grounded.vehicle, operation)()
+
+
 async def test_land_refused_says_why(flying: Flight) -> None:
     flying.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.FAILED, "Mode change to LAND failed: no")
     with pytest.raises(CommandRejected, match="Mode change to LAND failed: no"):

@@ -26,8 +26,9 @@ async def _start_mission(flight: Px4Flight) -> None:
     flight.wire.clear()
 
 
+@pytest.mark.parametrize("item", [0, 2], ids=["the current item", "another item"])
 @pytest.mark.parametrize("party", ["a pilot", "the program"])
-async def test_set_current_is_not_resent_after_takeover(party: str) -> None:
+async def test_set_current_is_not_resent_after_takeover(party: str, item: int) -> None:
     async with open_px4() as flight:
         await _start_mission(flight)
         flight.px4.faults.lose(m.MissionCurrent, times=100)
@@ -42,7 +43,7 @@ async def test_set_current_is_not_resent_after_takeover(party: str) -> None:
 
             tasks.start_soon(interfere)
             with pytest.raises(OperationRejected, match=r"not sent again: (the mode|another order)"):
-                await flight.vehicle.mission.set_current(2)
+                await flight.vehicle.mission.set_current(item)
         assert len(flight.wire.all(m.MissionSetCurrent)) == 1
 
 

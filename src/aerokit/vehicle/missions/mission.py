@@ -463,8 +463,10 @@ class MissionControl(VehiclePlan["Mission"]):
                     raise
                 # The item itself may have changed the mode: PX4 leaves MISSION for a return.
                 if order.is_newest:
+                    reported = self._tracker.current
                     with anyio.move_on_after(END_GRACE_S):
-                        await self._tracker.current.wait_until(lambda current: current == item)
+                        # An earlier report confirms nothing.
+                        await reported.wait_until(lambda now: now == item and reported.updated_at > order.given_at)
                         return
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
 
