@@ -320,7 +320,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-        # Entries arrive in the order of their ids. All missing ones precede this entry, so they must be requested again.
+        # Entries arrive in the order of their ids. All missing ones precede this entry, so they are requested again.
         elif message.id > next(reversed(self._missing)):  # the largest missing id
             self._request_missing(now)
         self._set_deadline()
