@@ -55,7 +55,7 @@ class ThreadFuture(Generic[T]):
     def result(self) -> T:
         """Return the result, or raise the error. An error is raised only once.
 
-        Raises LookupError if there is neither.
+        Raises LookupError if there is no result and no error.
         """
         error = self.pop_exception()
         if error is not None:

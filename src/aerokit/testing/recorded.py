@@ -182,7 +182,8 @@ class RecordedMissions(MissionServer):
 
 def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, wants_float: bool) -> AnyItem:
     """Convert a recorded item to MISSION_ITEM (``wants_float``) or MISSION_ITEM_INT."""
-    # Degrees for global frames, metres for local ones. In MAV_FRAME_MISSION, x and y are neither.
+    # In MISSION_ITEM_INT, x and y are degrees times 1e7, in local frames metres times 1e4, and in MAV_FRAME_MISSION
+    # numbers without a scale.
     scale = 1.0 if item.frame == MavFrame.MISSION else 1e4 if item.frame in LOCAL_FRAMES else 1e7
     was_float = isinstance(item, m.MissionItem)
     converted = item_from(item)  # with x and y as recorded

@@ -238,7 +238,7 @@ async def run_fly(options: argparse.Namespace) -> int:
         items = getattr(plan, part).to_items()
         if items:
             emit_items(options, part, items, "in the file")
-    # `_connect_and_fly` appends its flight to `flights`, so that its state is known here after an interrupt.
+    # `_connect_and_fly` appends the flight, so that the flight's state is known here after an interrupt.
     flights: list[PlanFlight] = []
     interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):

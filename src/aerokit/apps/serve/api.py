@@ -257,8 +257,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One HTTP method of one path.
 
-    ``name`` is the operationId. An operation that gives an order has its type in ``order``. An operation that only
-    checks the arguments of an order has the order's type in ``body_type``.
+    ``name`` is the operationId. ``order`` is the type of the order that the operation gives. ``body_type`` is the type
+    of an order whose arguments the operation only checks.
     """
 
     method: str
