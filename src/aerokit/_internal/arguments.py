@@ -177,7 +177,7 @@ def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
         is_left, left_text = _rule(node.left, module_globals)
         is_right, right_text = _rule(node.right, module_globals)
         return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
-    # The constants in our annotations are None, and the `...` of tuple[X, ...], whose rule is not used.
+    # In our annotations, a constant is None or the `...` of tuple[X, ...]. The rule of `...` is not used.
     if isinstance(node, ast.Constant):
         return _SIMPLE["None"]
     if isinstance(node, ast.Subscript):

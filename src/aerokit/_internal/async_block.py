@@ -99,8 +99,8 @@ _SETTER_CALLS = {
 class ReadOnly:
     """Base class of public objects whose attributes report the state of the vehicle.
 
-    Assigning to a state cell, a property or a sub-object raises AttributeError. Its text names the method to call, for
-    example ``set_mode`` for ``vehicle.mode = "GUIDED"``. A program may add attributes.
+    Assigning to a state cell, a property or a sub-object raises AttributeError. The error text names the method to
+    call, for example ``set_mode`` for ``vehicle.mode = "GUIDED"``. A program may add attributes.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -14,7 +14,7 @@ T = TypeVar("T")
 class ThreadFuture(Generic[T]):
     """A result or an error that another thread sets. Waiting for it is safe for Ctrl-C at every moment.
 
-    It uses a plain lock. ``threading.Condition``, and with it ``Event`` and ``Future``, is Python code that Ctrl-C can
+    It uses a plain lock. ``Event`` and ``Future`` use ``threading.Condition``, which is Python code that Ctrl-C can
     interrupt between any two lines: KeyboardInterrupt then becomes ``RuntimeError: release unlocked lock``, or a lock
     that the other thread needs stays acquired.
     """

@@ -241,7 +241,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        # Number of answers sent from each list of recorded answers. The key has the `id()`s of the answers in the list.
+        # Number of answers sent from each list of recorded answers. The `id()`s of its answers identify a list.
         self._answered_counts: dict[tuple[int, ...], int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""
@@ -326,9 +326,9 @@ class RecordedVehicle(SimulatedVehicle):
         return None  # The acknowledgements were recorded, so no further one is sent.
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
-        """Return the recorded answer to a command, or None.
+        """Return the next recorded answer to a command; None if none was recorded.
 
-        Equal commands get successive answers. The last answer repeats.
+        After the last answer, the last answer is returned again.
         """
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
@@ -341,7 +341,6 @@ class RecordedVehicle(SimulatedVehicle):
             candidates = answers
         if not candidates:
             return None
-        # Commands with the same candidates get them in turn.
         list_id = tuple(map(id, candidates))
         count = self._answered_counts.get(list_id, 0)
         self._answered_counts[list_id] = count + 1

@@ -261,7 +261,7 @@ class Track(Sequence[TrackPoint]):
         return max(self, key=lambda point: point.speed_m_s)
 
     def _farthest(self, center: Position) -> tuple[float, TrackPoint]:
-        """Return the maximum horizontal distance from a position in metres, and the point of the track."""
+        """Return the maximum horizontal distance from a position in metres, and the farthest point."""
         self._check_not_empty()
         offset_of = metres_from(center)
         farthest = max(self, key=lambda point: math.hypot(*offset_of(point)))

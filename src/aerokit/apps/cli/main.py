@@ -175,7 +175,7 @@ class Parser(argparse.ArgumentParser):
 
     def _check_option_names(self, args: Sequence[str]) -> None:
         # Report unknown options before argparse does, because argparse would take the value after an unknown option for
-        # a positional argument. --connect is skipped, because misplaced_address() reports the right command line.
+        # a positional argument. --connect is left to misplaced_address(), which prints the right command line.
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
