@@ -149,7 +149,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "component_twins": ("aerokit.onboard.opening.component",),
 }
 
-# Maps each page to the hand-written function (module and name) that opens these contexts on a loop thread.
+# Maps each page to the hand-written function (module and name) that opens such a context on a loop thread.
 OPENERS = {
     "twins": ("aerokit.sync.blocks", "opened"),
     "fleet_twins": ("aerokit.sync.fleet_blocks", "opened_fleet"),

@@ -92,7 +92,7 @@ class RecordedParameters(ParameterProtocolServer):
         if name not in self.names:
             self._refuse(request, index=-1, channel=channel)  # -1 because the request has no index
             return
-        # If the recording has no successful write of the parameter, the vehicle keeps and sends the present value.
+        # Without a successful write in the recording, the parameter keeps its value. The answer is the present value.
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
         self.send(name, self.names.index(name), None)

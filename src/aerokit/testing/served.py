@@ -143,7 +143,7 @@ def hosted_flight(
         try:
             yield flight
         finally:
-            portal.call(scheduler.record)  # Append the final points, because the tracks are not refreshed any more.
+            portal.call(scheduler.record)  # Append the last points of the tracks before refreshing ends.
             scheduler.refresh_with(None)
             with flight._raising_once():
                 serving.__exit__(None, None, None)

@@ -110,8 +110,8 @@ def content_policy(tiles: str | None) -> str:
 class SecurityMiddleware:
     """ASGI middleware that rejects foreign hosts and origins, and adds security headers to every response.
 
-    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``, which prevents DNS rebinding. An
-    Origin, if a browser sends one, must be this server, so that pages of other sites cannot make requests.
+    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``. This prevents DNS rebinding. If a
+    browser sends an Origin, it must be this server. Pages of other sites therefore cannot make requests.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], tile_url: str | None) -> None:

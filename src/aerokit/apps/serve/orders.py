@@ -144,10 +144,7 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Met
 
 
 def parameter_order(metadata: Metadata | None) -> OrderType:
-    """Return the order type that sets a parameter.
-
-    The result of such an order has a note if the value's range was not checked.
-    """
+    """Return the order type that sets a parameter. Its result has a note if the value's range was not checked."""
     return replace(SET_PARAMETER, run=partial(_set_parameter, metadata=metadata))
 
 
@@ -457,10 +454,7 @@ class OrderRunner:
         self._publish(record)
 
     def _replaced_by(self, record: OrderRecord, error: Exception) -> str | None:
-        """Return the key of the newest motion order that replaced this one, or None.
-
-        ``error`` is the error with which this order ended.
-        """
+        """Return the key of the newest later motion order if ``error`` says that this order was replaced; else None."""
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
         newest_key = None
