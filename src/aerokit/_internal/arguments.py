@@ -80,7 +80,7 @@ def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
 def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> FunctionT:
     """Decorator that raises InvalidArgument for arguments that do not fit their annotations.
 
-    With ``times_are_above_zero``, a time must not be 0.
+    With ``times_are_above_zero``, times must be above 0.
     """
     rules = _Rules(inspect.unwrap(function), times_are_above_zero)
     if inspect.iscoroutinefunction(function):
@@ -177,7 +177,7 @@ def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
         is_left, left_text = _rule(node.left, module_globals)
         is_right, right_text = _rule(node.right, module_globals)
         return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
-    # The constants in our annotations are None, and the `...` of tuple[X, ...], whose rule is not used.
+    # In our annotations, a constant is None or the `...` of tuple[X, ...]. The rule of `...` is not used.
     if isinstance(node, ast.Constant):
         return _SIMPLE["None"]
     if isinstance(node, ast.Subscript):
@@ -276,7 +276,7 @@ def check_kind(name: str, value: object, expected_type: type) -> None:
 def check_range(name: str, value: float, minimum: float, maximum: float, *, above: bool = False) -> None:
     """Raise InvalidArgument unless ``value`` is between the limits.
 
-    With ``above``, it must not be ``minimum`` itself.
+    With ``above``, ``minimum`` itself is not allowed.
     """
     try:
         is_allowed = minimum <= value <= maximum and not (above and value == minimum)

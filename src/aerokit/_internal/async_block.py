@@ -99,8 +99,8 @@ _SETTER_CALLS = {
 class ReadOnly:
     """Base class of public objects whose attributes report the state of the vehicle.
 
-    Assigning to a state cell, a property or a sub-object raises AttributeError. Its text names the method to call, for
-    example ``set_mode`` for ``vehicle.mode = "GUIDED"``. A program may add attributes.
+    Assigning to a state cell, a property or a sub-object raises AttributeError. The error text names the method to
+    call, for example ``set_mode`` for ``vehicle.mode = "GUIDED"``. A program may add attributes.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -108,8 +108,8 @@ class ReadOnly:
         attribute = inspect.getattr_static(type(self), name, None)
         is_setter = isinstance(attribute, property) and attribute.fset is not None
         is_descriptor = hasattr(type(attribute), "__get__")
-        # A program may replace a method, for example by a mock. Without a descriptor, the attribute is one that the
-        # constructor sets or the program adds.
+        # A program may replace a method, for example by a mock. An attribute without a descriptor is set by the
+        # constructor, or added by the program.
         if name.startswith("_") or is_setter or callable(attribute) or not is_descriptor:
             object.__setattr__(self, name, value)
             return

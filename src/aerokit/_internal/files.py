@@ -95,8 +95,8 @@ def read_text(path: str | os.PathLike[str]) -> str:
 class PartFile:
     """A download in progress: until :meth:`finish`, ``<destination><mark>.part`` holds the beginning of the file.
 
-    ``mark`` identifies the file that is downloaded, so that a partial file of another one is not continued. Use it in a
-    `with` statement, which raises OSError while another download of this program writes the file.
+    ``mark`` identifies the file that is downloaded, so that the partial download of another file is not continued. Use
+    the object in a `with` statement, which raises OSError while another download of this program writes the file.
     """
 
     _claimed: ClassVar[dict[str, PartFile]] = {}  # maps absolute paths to the downloads that write these files

@@ -78,7 +78,7 @@ def printable(text: str) -> str:
 def format_value(value: object) -> str:
     """Format an event's field for people.
 
-    Enum members have their name. Floats have three significant digits. Floats from 1000 are formatted as integers.
+    Enum members are formatted as their names, floats with three significant digits, and floats from 1000 as integers.
     """
     if isinstance(value, float):
         return f"{value:.0f}" if abs(value) >= 999.5 else f"{value:.3g}"  # 999.5 is rounded to 1000.

@@ -89,8 +89,8 @@ def _generate_init(cls: Any) -> Any:
 class Snapshot(metaclass=_SnapshotType):
     """Base class of immutable, comparable, printable values.
 
-    A subclass may define ``_check(self)`` to raise InvalidArgument for invalid fields. The constructor takes the fields
-    of base classes first; they keep their defaults.
+    A subclass may define ``_check(self)`` to raise InvalidArgument for invalid fields. In the constructor, the fields
+    of base classes come first, with their defaults.
     """
 
     __match_args__: ClassVar[tuple[str, ...]]

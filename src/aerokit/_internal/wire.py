@@ -46,12 +46,12 @@ class _CounterFields:
 
 
 class Copyable:
-    """Makes objects whose fields are defined by compiled code, not by ``__slots__``, copyable and picklable."""
+    """Makes objects with compiled fields copyable and picklable."""
 
     __slots__ = ()
 
     def __getstate__(self) -> tuple[None, dict[str, Any]]:
-        # Python's own method finds only fields that are declared as __slots__, and compiled fields are not.
+        # Python's own method does not find compiled fields, because they are not declared in __slots__.
         names = (
             name
             for cls in type(self).__mro__

@@ -267,7 +267,7 @@ class _TopicChannels:
                 name, schema=dict(make_topic().schema), message_encoding="json", context=self.context
             )
         if not channel.has_sinks():
-            self._sent_at.pop(name, None)  # so that the first of the next viewers gets the current value
+            self._sent_at.pop(name, None)  # so that the next viewer gets the current value
             return False
         return updated_at > self._sent_at.get(name, -math.inf)
 

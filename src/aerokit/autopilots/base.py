@@ -85,7 +85,7 @@ class SetpointRules(Snapshot):
     """Set-points that the autopilot supports, and how it treats a stream of set-points.
 
     - ``stream_before_mode``: the stream must be running before the mode is requested.
-    - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the heading or its target, not to north.
+    - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is a turn, not a heading.
     - ``position_restarts_path``: each position set-point, even a repeated set-point, restarts the path from a
       standstill.
     - ``trajectory``: set-points of positions with velocity and acceleration are supported.
@@ -113,8 +113,8 @@ class StickRules(Snapshot):
     """How an autopilot interprets MANUAL_CONTROL.
 
     - ``signed_throttle``: if True, the throttle ranges from −1000 to 1000; otherwise from 0 to 1000.
-    - ``release``: how the sticks are released to the transmitter. ``"axes"``: by MANUAL_CONTROL with axes that have no
-      value; ``"channels"``: by RC_CHANNELS_OVERRIDE with channels of 0; ``"none"``: there is no such message.
+    - ``release``: the message that returns control to the transmitter. ``"axes"``: MANUAL_CONTROL with axes that have
+      no value; ``"channels"``: RC_CHANNELS_OVERRIDE with channels of 0; ``"none"``: the autopilot has no such message.
     """
 
     signed_throttle: bool = False

@@ -28,11 +28,11 @@ ExternalKind: TypeAlias = Literal[
 class ExternalRule(Snapshot):
     """Parameter values with which the autopilot uses one kind of measurement.
 
-    - ``required``: the names of each parameter in several firmware versions, and its suitable values. The autopilot
-      ignores the measurements unless all these parameters have one of these values.
-    - ``sole_source``: the name of each parameter, and its suitable values. If all have one of these values, the
-      measurement is the estimator's only source of position or velocity. The vehicle must have the first parameter.
-      Others that it does not have are ignored.
+    - ``required``: parameters, each with its names in several firmware versions and its suitable values. The autopilot
+      uses the measurements only if every parameter has a suitable value.
+    - ``sole_source``: parameters, each with its suitable values. If every parameter has a suitable value, the
+      measurement is the estimator's only source of position or velocity. The vehicle must have the first parameter;
+      others that it does not have are ignored.
     """
 
     required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()

@@ -60,7 +60,7 @@ navigator parameters of PX4.
 
 
 def gcs_failsafe(firmware: str, value_of: Callable[[str], float | None]) -> tuple[str | None, str | None]:
-    """Return the name of the parameter that decides about the failsafe, and its action, such as ``lands``.
+    """Return the name of the parameter that sets the action of the failsafe, and the action, such as ``lands``.
 
     The action is None if ``value_of`` returns None for the parameter. Both are None if no parameter sets an action.
     """

@@ -21,7 +21,7 @@ class Mode(Snapshot):
     """A flight mode as reported by HEARTBEAT (https://mavlink.io/en/messages/minimal.html#HEARTBEAT).
 
     ``name`` is the autopilot's name (``"GUIDED"``, ``"POSCTL"``), or ``"MODE 42"`` for an unknown number;
-    ``custom_mode`` is the number. ``base_mode`` (MAV_MODE_FLAG) is not compared, because it changes with arming.
+    ``custom_mode`` is the number. ``base_mode`` (MAV_MODE_FLAG) changes with arming, so ``==`` ignores it.
     ``str(mode)`` is the name.
     """
 

@@ -218,11 +218,8 @@ class Px4(Autopilot):
         return (self.mode(px4_custom_mode(main & 0xFF, sub & 0xFF), CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name of an external mode, or of a mode that is not known yet; otherwise None.
-
-        PX4 reports the name "(Mode not available)" for an external mode that is not registered.
-        """
-        if name.startswith("("):
+        """Return the name to store for a mode, or None. The name of an external mode replaces EXTERNAL1 etc."""
+        if name.startswith("("):  # "(Mode not available)": this external mode is not registered
             return None
         if custom_mode in _EXTERNAL_MODES:
             return name or None

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# Answers arrive in the order of the requests. A request counts as lost once a request that was sent this many
-# transmissions later has been answered.
+# Answers arrive in the order of the requests. When a request is answered, all unanswered requests that were sent at
+# least this many transmissions before it count as lost.
 OVERTAKEN = 3
 
 # Number of requests that are sent at once. ArduPilot queues at most five, processes one every 2 ms, and drops the rest.
 BATCH_SIZE = 4
 
-# Pause between further requests, after the first ``BATCH_SIZE`` were sent at once.
+# Pause between two requests while at least ``BATCH_SIZE`` are in flight.
 SPACING_S = 0.002
 
 # An answer that arrives sooner than this fraction of the fastest round trip belongs to an earlier transmission.
@@ -38,8 +38,8 @@ class AdaptiveWindow:
     """Limits the number of requests in flight to what the link carries without delaying the answers.
 
     The window grows while answers arrive as fast as the fastest answers so far. It shrinks when answers take much
-    longer, because they then wait in a queue. Loss does not shrink the window unless most requests are lost, because
-    radios lose frames even if they carry little.
+    longer, because they then wait in a queue. Loss shrinks the window only if most requests are lost, because radios
+    lose frames even if they carry little.
     """
 
     def __init__(self, *, start: int = 4, min_size: int = 2, max_size: int = 64) -> None:
@@ -57,10 +57,7 @@ class AdaptiveWindow:
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
-        """Record an answer that arrived ``seconds`` after its request.
-
-        None means that the time does not describe the link.
-        """
+        """Record an answer. ``seconds`` is the time since its request, or None if it must not be measured."""
         self._loss -= LOSS_WEIGHT * self._loss  # The average moves towards 0 with an answer, towards 1 with a loss.
         if seconds is None:
             return
@@ -79,13 +76,13 @@ class AdaptiveWindow:
 
 
 class _BlockRequest:
-    """The request for one block. Its latest transmission has the number ``transmission_number`` in the transfer."""
+    """The request for one block."""
 
     __slots__ = ("attempts", "previous_sent_at", "sent_at", "transmission_number")
 
     def __init__(self) -> None:
         self.attempts = 0
-        self.transmission_number = 0
+        self.transmission_number = 0  # of the latest transmission, counted over all blocks
         self.previous_sent_at = 0.0
         self.sent_at = 0.0
 
@@ -93,8 +90,8 @@ class _BlockRequest:
 class BlockRequests:
     """Requests for blocks, keyed by offset. An adaptive window limits the number of requests in flight.
 
-    The first ``batch_size`` requests are sent without delay, further ones ``spacing_s`` seconds apart. A request is
-    repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
+    Requests are sent without delay if fewer than ``batch_size`` are in flight, otherwise ``spacing_s`` seconds apart. A
+    request is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, batch_size: int = BATCH_SIZE, spacing_s: float = SPACING_S) -> None:
@@ -102,15 +99,15 @@ class BlockRequests:
         self._round_trip = round_trip
         self._batch_size = batch_size
         self._spacing_s = spacing_s
-        # All keys are offsets. An overdue block is in `_waiting` and still in `_sent_blocks`.
+        # The keys of these dictionaries are offsets.
         self._waiting: dict[int, None] = {}  # blocks to request, in order
         self._in_flight: dict[int, _BlockRequest] = {}  # in the order in which they were sent
-        self._sent_blocks: dict[int, _BlockRequest] = {}  # blocks that were requested and have not arrived
+        self._sent_blocks: dict[int, _BlockRequest] = {}  # blocks in flight, or waiting to be requested again
         self._sent_count = 0
         self._timeouts = 0  # number of timeouts since the last answer
-        self._busy_until = float("-inf")  # until this time, the server is busy with a burst
-        self._next_send_at = float("-inf")  # earliest time for the next request beyond the first `batch_size`
-        self._must_wait_to_send = False  # True if a request fits into the window, but must wait until `_next_send_at`
+        self._busy_until = float("-inf")  # The server sends a burst until this time.
+        self._next_send_at = float("-inf")  # earliest time to send while `batch_size` or more requests are in flight
+        self._must_wait_to_send = False  # True if a request waits only for `_next_send_at`
 
     def __len__(self) -> int:
         return len(self._waiting) + len(self._in_flight)
@@ -160,7 +157,7 @@ class BlockRequests:
             self._requeue_overtaken(block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
-        """Return when the answered transmission was sent. None if it is unknown which one was answered."""
+        """Return when the answered transmission was sent, or None if it is unknown which one was answered."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0

@@ -31,7 +31,7 @@ __all__ = [
 MAX_ATTEMPTS = 4
 """Maximum number of transmissions of a command that may be repeated."""
 
-# A condition in UNREPEATABLE_COMMANDS has the index of a parameter, and the value that makes it true.
+# Conditions in UNREPEATABLE_COMMANDS: the index of a parameter, and the value that it must have.
 _PARAM1_IS_0, _PARAM1_IS_1, _PARAM1_IS_2, _PARAM4_IS_1 = (0, 0.0), (0, 1.0), (0, 2.0), (3, 1.0)
 
 # Commands whose repetition has a further effect. Maps MAV_CMD to (effect, condition). If the condition is None, every
@@ -71,7 +71,7 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
 
 
 def allowed_attempts(command: int, params: Sequence[float]) -> int:
-    """Return how often a command may be sent: `MAX_ATTEMPTS`, or once if a repetition would have a further effect."""
+    """Return the maximum number of transmissions: 1 if a repetition would have a further effect, otherwise 4."""
     if command not in UNREPEATABLE_COMMANDS:
         return MAX_ATTEMPTS
     _, condition = UNREPEATABLE_COMMANDS[command]
@@ -87,7 +87,7 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# An order is sent again only after a new HEARTBEAT. The exchange checks at this interval whether one has arrived.
+# Interval of the checks for a new HEARTBEAT, after which a command with an `OrderStatus` may be repeated.
 POLL_INTERVAL_S = 0.05
 
 MAX_HEARTBEAT_AGE_S = 2.5
@@ -97,18 +97,17 @@ Two HEARTBEATs may be lost. Ground-station failsafes act later (FS_GCS_TIMEOUT 5
 be older when it is processed, if the event loop was blocked.
 """
 
-# The arrival of a HEARTBEAT triggers the repetition of an order, but not before this fraction of ``attempt_timeout``
-# has passed. With a fraction of 1, a HEARTBEAT that arrives slightly early would not count, and the repetition would be
-# late by a second.
+# A HEARTBEAT triggers a repetition if it arrives after this fraction of ``attempt_timeout``. With a fraction of 1, a
+# HEARTBEAT that arrives slightly early would not count, and the repetition would be late by a second.
 MIN_RESEND_FRACTION = 0.75
 
 
 class OrderStatus(Protocol):
-    """State of an order. It determines whether the order may be sent again."""
+    """Determines whether a command may be sent again."""
 
     @property
     def end(self) -> str:
-        """Text that explains why the order has ended; empty while the order may be sent again."""
+        """Text that explains why the command must not be sent again; empty while it may be sent again."""
         ...
 
     @property
@@ -169,15 +168,13 @@ def command_int(
 
 
 class CommandExchange(Exchange[CommandAck]):
-    """Sends one command until its result is known. The result is the COMMAND_ACK with ACCEPTED.
+    """Sends one command, and repeats it until it is acknowledged. The result is the COMMAND_ACK with ACCEPTED.
 
-    ``confirmation`` counts the repetitions. An IN_PROGRESS extends the deadline by ``progress_timeout``, and calls
-    ``on_progress`` with 0–100, or None if the vehicle does not report a percentage. Acknowledgements to other ground
-    stations, or from other components than the target, are ignored.
+    Without an ``order_status``, the command is repeated every ``attempt_timeout`` seconds. With an ``order_status``, it
+    is repeated only after a new HEARTBEAT, so never to a silent vehicle, and no longer once ``order_status.end`` has a
+    text.
 
-    A command without ``order_status`` is a request, and is repeated every ``attempt_timeout`` seconds. An order is
-    repeated only after a new HEARTBEAT, so it is never sent again to a silent vehicle. Once ``order_status.end`` has a
-    text, the order is not repeated.
+    Acknowledgements to other ground stations, or from other components than the target, are ignored.
 
     Args:
         message: the command.
@@ -185,13 +182,13 @@ class CommandExchange(Exchange[CommandAck]):
         own_component: our component id.
         attempts: maximum number of transmissions; None: 4, or 1 for a command in `UNREPEATABLE_COMMANDS`.
         attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for a command in `UNREPEATABLE_COMMANDS`.
-        progress_timeout: seconds without any answer after an IN_PROGRESS, until the command fails.
-        on_progress: called with each progress report.
+        progress_timeout: seconds from an IN_PROGRESS until the command fails, unless another answer arrives.
+        on_progress: called at each IN_PROGRESS with 0–100, or None if the vehicle does not report a percentage.
         earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with
             the same MAV_CMD. Once this command was repeated, every acknowledgement counts.
         acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
-        order_status: the state of the order; None for a request.
+        order_status: determines whether the command may be repeated; None if nothing prevents it.
         is_sent: True if the caller itself makes the first transmission. The exchange then only repeats the command.
 
     Raises from ``result()``:
@@ -228,9 +225,9 @@ class CommandExchange(Exchange[CommandAck]):
             attempts = allowed_attempts(message.command, _params_of(message))
             is_unrepeatable = attempts == 1
         if attempt_timeout is None:
-            # A command that must not be repeated waits as long as all attempts of another command together.
+            # A command that must not be repeated gets the time of four attempts.
             attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
-        if attempt_timeout > 0:  # Other values are refused below, with the value that the caller gave.
+        if attempt_timeout > 0:  # Other values are refused below, and the error must show them unchanged.
             attempt_timeout = max(attempt_timeout, min_timeout_s)
         if attempts < 1:
             raise InvalidArgument(f"attempts = {attempts} is not allowed: it must be at least 1")
@@ -260,8 +257,7 @@ class CommandExchange(Exchange[CommandAck]):
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
         # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
-        # command is repeated. A command with a single attempt ignores none, because it would wait in vain if it ignored
-        # its own acknowledgement.
+        # command is repeated. A command with a single attempt ignores none, because its own may be the only one.
         may_ignore = self._transmitted_count == 1 and self._attempts > 1
         is_to_earlier_command = not self._transmitted_count or (
             may_ignore and self._answer_count < self._earlier_answers
@@ -279,7 +275,7 @@ class CommandExchange(Exchange[CommandAck]):
 
     @property
     def pending_answers(self) -> int:
-        """Number of acknowledgements that may still arrive, which the next command with this MAV_CMD must ignore."""
+        """Number of acknowledgements that may still arrive. The next command with this MAV_CMD must ignore them."""
         # Once the command was repeated, every acknowledgement counts as an answer to this command; see `receive`.
         ignored_answers = self._earlier_answers if self._transmitted_count <= 1 else 0
         own_answers = max(0, self._answer_count - ignored_answers)
@@ -294,10 +290,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._dropped_count += 1
 
     def expire(self, now: float) -> None:
-        """After the deadline, repeat the command. Fail after the last attempt, or if progress reports have stopped.
-
-        A command with an ``order_status`` is handled by `_expire_order`.
-        """
+        """After the deadline, repeat the command. Fail after the last attempt, or if progress reports have stopped."""
         if self.deadline is None or now < self.deadline:
             return
         if self._in_progress:
@@ -318,7 +311,7 @@ class CommandExchange(Exchange[CommandAck]):
         if now >= give_up_at:
             self._time_out(now, self._why_not_repeated())
             return
-        # A HEARTBEAT after this time shows that the link to the vehicle works, so the order may be repeated.
+        # A HEARTBEAT after this time shows that the link to the vehicle works.
         min_heartbeat_at = max(self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout, now - MAX_HEARTBEAT_AGE_S)
         if self._sent_count < self._attempts and order_status.heartbeat_at >= min_heartbeat_at:
             self._send(now)
@@ -338,7 +331,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        # The deadline of an order is earlier: from then on, `_expire_order` checks whether the order may be repeated.
+        # From the earlier deadline on, `_expire_order` checks whether the command may be repeated.
         if self._order_status is not None:
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
@@ -352,8 +345,8 @@ class CommandExchange(Exchange[CommandAck]):
         return CommandLong(**fields)
 
     def _is_ours(self, ack: CommandAck) -> bool:
-        # The caller passes only messages of the target system. In MAVLink 1, and from old firmware, an acknowledgement
-        # has no target fields, which then count as 0 (all).
+        # The caller passes only messages of the target system. The target fields are 0 (all) in MAVLink 1 and in
+        # messages of old firmware.
         own_system, own_component = self._own_ids
         component = self._message.target_component
         frame = ack.received_frame

@@ -160,8 +160,7 @@ class RoundTrip:
         return min(backed_off_s, max(self._max_s, first_timeout_s))
 
 
-# If nothing arrives in the time in which the vehicle sends this many messages, it has stopped sending. Radios hardly
-# ever lose so many in a row.
+# A stream has ended if nothing arrives in the time of this many messages. Radios hardly ever lose so many in a row.
 SILENT_MESSAGES = 10
 
 
@@ -210,7 +209,7 @@ class MessageStream:
         elapsed_s = now - self._last_at
         if self._has_started and messages > 0:
             self._interval.add_sample(elapsed_s / messages)
-        elif not self._has_started and self.failures == 0:  # The first message answers the only request.
+        elif not self._has_started and self.failures == 0:  # The request was sent once, and this is its first answer.
             self._round_trip.add_sample(elapsed_s)
         self._last_at = now
         self._has_started = True
@@ -245,7 +244,7 @@ _MAX_RANGES = 10
 
 
 def is_addressed_to(message: Any, system_id: int, component_id: int) -> bool:
-    """Return True if a message is for this component or for all (target 0). Old firmware sends without targets (0)."""
+    """Return True if a message is addressed to this component or to all (0). Old firmware leaves the target 0."""
     return message.target_system in (0, system_id) and message.target_component in (0, component_id)
 
 
@@ -328,13 +327,13 @@ class Transfer(Exchange[ResultT]):
 # An answer that arrives sooner than this fraction of the fastest round trip so far belongs to an earlier request.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# After this many early answers for one name, further ones are accepted, because the vehicle has become faster. Without
-# this limit, all answers of a vehicle that was slow at first would be refused until the idle timeout.
+# For each name, early answers to at most this many requests are refused. Without this limit, all answers of a vehicle
+# that has become faster would be refused until the idle timeout.
 MAX_EARLY_ANSWERS = 2
 
 
 class StaleAnswerFilter:
-    """Detects answers that arrive too early to belong to the last request, because they answer an earlier request."""
+    """Detects answers that arrive too early for the latest request, and therefore answer an earlier one."""
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
@@ -343,9 +342,9 @@ class StaleAnswerFilter:
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
         """Return True if ``now`` is too early for an answer to the request for ``name`` sent at ``sent_at``.
 
-        ``attempts`` is the number of transmissions of the request. After MAX_EARLY_ANSWERS early answers for a name,
-        False is returned for further ones, because the vehicle has become faster. False does not prove that an answer
-        is new: it may be meant for another station. The caller must check it in other ways too.
+        ``attempts`` is the number of transmissions of the request. For each name, True is returned for at most
+        MAX_EARLY_ANSWERS requests; after that, the vehicle counts as faster than before. The caller must also check the
+        answer in other ways, because it may be meant for another station.
         """
         elapsed_s = now - sent_at
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):

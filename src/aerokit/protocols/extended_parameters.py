@@ -34,7 +34,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 
 UNKNOWN_INDEX = 0xFFFF
-MAX_QUIET_S = 1.1  # Maximum seconds of silence until a list counts as ended; fewer if its pauses were short so far.
+MAX_QUIET_S = 1.1  # A list counts as ended after at most this many seconds of silence.
 READ_WINDOW = 10
 # Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0
@@ -138,10 +138,10 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
 class SettingReads(NamedReads[Setting]):
     """Read some settings by name. The result has one answer for each name, in the order given.
 
-    Components do not answer requests for unknown names. A name that is not answered in time is therefore requested
-    again, together with the setting of index 0, which always exists. If index 0 is answered several times, but the name
-    never, the name's result is a ParameterRejected. After ``idle_timeout_s`` seconds without progress, the missing
-    answers become ParameterTimeout errors.
+    Components do not answer requests for unknown names. If a name is not answered in time, the setting with index 0,
+    which always exists, is therefore requested as well. If it is answered, but the name repeatedly is not, the result
+    for the name is a ParameterRejected. After ``idle_timeout_s`` seconds without progress, the missing answers become
+    ParameterTimeout errors.
     """
 
     expects: tuple[type[Message], ...] = (ParamExtValue,)
@@ -177,12 +177,13 @@ class SettingWrite(Transfer[Setting]):
     """Set one setting. The result is the setting as the component reports it afterwards.
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
-    answer arrives, the value is read:
+    answer arrives, the value is read. The next step depends on it:
 
-    - The value from before the write (``before``). PARAM_EXT_SET is sent again. The write fails if the component keeps
-      this value.
-    - Another value. The component rounded or clamped the value, or another station set it. PARAM_EXT_SET is not sent
-      again, because it would undo the other station's change. A value reported twice is the result.
+    - The requested value: the write is complete.
+    - The old value (``before``): PARAM_EXT_SET is sent again, because it may have been lost. The write fails if the
+      component keeps the old value.
+    - Another value: the value is read again. PARAM_EXT_SET is not sent again, because it would undo the change if
+      another station has set the value. A value reported twice in a row is the result.
 
     Raises from ``result()``:
         ParameterRejected: the component refused (``code`` is the PARAM_ACK), or keeps the previous value.
@@ -260,10 +261,7 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
-        """Write or read again until enough equal answers have arrived.
-
-        The result is then the reported value. If that is the value from before the write, the write has failed.
-        """
+        """Write or read again, unless enough equal answers have arrived."""
         self._repeated_answers.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
         if not self._repeated_answers.are_conclusive(is_unchanged=is_unchanged):

@@ -179,7 +179,7 @@ def path_bytes(path: str) -> bytes:
 
 
 def file_error(request_opcode: int, path: str, code: int, errno: int | None) -> FileError:
-    """Create the error for a NAK with this MAV_FTP_ERR (``code``) and, for FAILERRNO, this error number."""
+    """Create the error for a NAK. ``code`` is its MAV_FTP_ERR, ``errno`` the error number of a FAILERRNO."""
     operation = OPERATIONS.get(request_opcode, f"operation {request_opcode}")
     text = CODES.get(code, "unknown error code")
     name = MavFtpErr(code).name if code in CODES else f"code {code}"
@@ -207,8 +207,8 @@ ATTEMPTS_BEFORE_BACKOFF = 3
 
 SESSION_OPCODES = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
-# Errors that mean "no file is open". PX4 answers INVALIDSESSION, ArduPilot FILENOTFOUND. After a FILEEXISTS, PX4 also
-# refuses all other requests with FILEEXISTS, until an operation fails with an errno.
+# Errors that may mean "no file is open". PX4 answers INVALIDSESSION, ArduPilot FILENOTFOUND. After one FILEEXISTS, PX4
+# sends FILEEXISTS instead of any other error, until an operation fails with an errno.
 NO_SESSION_ERRORS = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 
 
@@ -410,8 +410,8 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _is_already_done(self, reply: FtpMessage) -> bool:
         opcode = self._request.opcode
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            # Any NAK means that there is no session, because ArduPilot and PX4 refuse a close for no other reason. The
-            # code is not compared, because PX4 sends several, see `NO_SESSION_ERRORS`.
+            # ArduPilot and PX4 refuse to close a session only if it is not open. PX4 has several errors for this; see
+            # `NO_SESSION_ERRORS`.
             return True
         if self.attempts == 1:
             return False

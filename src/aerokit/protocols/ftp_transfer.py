@@ -35,22 +35,23 @@ __all__ = ["FtpDownload", "FtpUpload", "is_virtual"]
 # Errors by which servers answer a burst request if they do not support bursts.
 NO_BURST = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 WINDOW_DURING_BURST = 4
-# If more blocks than this are missing, they are requested before the next burst. All blocks after the first missing one
-# stay in memory, so there must not be too many of them.
+# While this many blocks or more are missing, no burst is requested, because all blocks after the first missing one stay
+# in memory.
 MAX_GAPS = 512
 # Number of blocks that ArduPilot sends in one burst.
 BURST_BLOCKS = 500
-# After each received block of a burst, the server counts as busy for the time of this many blocks.
+# After the latest block of a burst, the server counts as busy for this many block intervals.
 BUSY_BLOCKS = 3
 # Minimum seconds to wait for the first block of a long file. In this time, even a slow radio carries a few blocks.
 FIRST_BLOCK_TIMEOUT_S = 0.5
-SHORT_FILE = 20 * DATA_SIZE  # Up to this size in bytes, repeating a burst costs little.
+SHORT_FILE = 20 * DATA_SIZE  # If a file has at most this many bytes, repeating its burst costs little.
 MAX_REPEATED_BURSTS = 3
 # Maximum number of remembered bursts. Blocks of earlier bursts may still arrive.
 MAX_BURSTS = 32
-# Sequence numbers wrap around, so they do not show the distance of two blocks that are farther apart than this.
+# A block that is this many bytes or more beyond all others is ignored. Sequence numbers wrap around, so they do not
+# prove that it belongs to the burst.
 MAX_BLOCK_DISTANCE = SEQUENCE_COUNT // 2 * DATA_SIZE
-# If no block arrives in the time in which the server sends this many blocks, the burst has not started, or has ended.
+# A burst counts as ended if no block arrives in the time of this many blocks: before its first block, and after it.
 # Radios hardly ever lose so many blocks in a row.
 MAX_LOST_FIRST_BLOCKS, MAX_LOST_BLOCKS = 4, 10
 
@@ -93,11 +94,10 @@ class _Burst(NamedTuple):
 
 
 class FtpDownload(FtpExchange[int]):
-    """Download of an open file from ``into.position`` on. The result is the size of the file.
-
-    ``into`` keeps the blocks received, even if the download fails.
+    """Download of an open file. The result is the size of the file.
 
     Args:
+        into: gets the file from ``into.position`` on. It keeps the received blocks even if the download fails.
         session: the session of the open file.
         size: the size that the server reported on opening; 0 if the server does not know it.
     """
@@ -122,15 +122,13 @@ class FtpDownload(FtpExchange[int]):
         self._bursts: deque[_Burst] = deque(maxlen=MAX_BURSTS)
         self._is_bursting = False
         self._failed_bursts = 0
-        self._bursts_without_new_block = 0  # number of bursts requested since the last block that was new
-        self._highest_blocks: dict[int, int] = {}  # by sequence number of a burst: the highest received block number
+        self._bursts_without_new_block = 0  # number of bursts requested since a missing block was received
+        self._highest_blocks: dict[int, int] = {}  # highest received block number, by the burst's sequence number
         self._supports_bursts = True
-        self._burst_active_at = 0.0  # time of the last block of a burst or, before any, of the request for the burst
-        # The burst of the last received block, the highest block number of this burst so far, and the time at which
-        # that block arrived.
-        self._last_burst: _Burst | None = None
-        self._highest_number = -1
-        self._highest_at = 0.0
+        self._burst_active_at = 0.0  # time of the latest burst request or block of a burst
+        self._last_burst: _Burst | None = None  # burst of the latest block
+        self._highest_number = -1  # highest block number received of this burst
+        self._highest_at = 0.0  # time at which the block with this number arrived
         self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
 
     def start(self, now: float) -> None:
@@ -203,7 +201,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
-        # The server sends one block per interval, so this many answers fit into a round trip without queueing.
+        # In a round trip, the server can send this many blocks, so this many requests in flight do not have to queue.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
@@ -218,8 +216,7 @@ class FtpDownload(FtpExchange[int]):
         if not is_latest:
             return
         # Before the first block, the errors in NO_BURST mean that the server does not support bursts. After it, they
-        # mean that the transfer has failed.
-        # `received_bytes` counts the bytes before `start`, too.
+        # mean that the transfer has failed. `received_bytes` includes the bytes before `start`.
         has_no_block = self._reassembly.received_bytes == self._reassembly.start
         if has_no_block and reply.error_code in NO_BURST:
             self._supports_bursts = False
@@ -231,7 +228,8 @@ class FtpDownload(FtpExchange[int]):
         self._requests.on_answer(offset, now, sent_at=sent.at)
         if reply.is_ack and reply.data and not self._is_past_size(offset):
             self._add(offset, reply.data, now)
-        # The end of the file is EOF, or an ACK without data. Data beyond the known size is dropped: the file has grown.
+        # EOF or an ACK without data marks the end of the file. Data beyond the known size is dropped: the file has
+        # grown.
         elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
             self._end_at(offset)
         else:
@@ -308,10 +306,10 @@ class FtpDownload(FtpExchange[int]):
 
     def _request_burst(self, now: float) -> None:
         offset = self._reassembly.tail
-        # The full blocks of the burst. If the size is unknown, ArduPilot's burst length is assumed.
+        # Maximum number of full blocks in the burst. If the size is unknown, ArduPilot's burst length is assumed.
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
-        # The numbers of the request, each block, a shorter block and the NAK are reserved, because a later request with
-        # one of them would look like a repetition. More than half of all numbers would wrap around in any case.
+        # Later requests must not have the numbers of this burst, because the server could take them for repetitions.
+        # Besides the full blocks, the request, a shorter last block and the NAK have a number each.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True

@@ -42,19 +42,18 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# A range should take about this many time-outs of the round trip, so that the pause after it is negligible.
+# Ranges grow until one takes this many time-outs. The pause between two ranges is then negligible.
 MIN_RANGE_TIMEOUTS = 60
 
 MAX_EARLY_ENDS = 3
 
 
 class LogDownload(Transfer[int]):
-    """Download of one log from ``into.position`` on. The result is the size of the log.
-
-    ``into`` keeps the blocks received, even if the download fails.
+    """Download of one log. The result is the size of the log.
 
     Args:
         size: the size in the log's entry.
+        into: gets the log from ``into.position`` on. It keeps the received blocks even if the download fails.
     """
 
     expects: tuple[type[Message], ...] = (LogData,)
@@ -76,7 +75,7 @@ class LogDownload(Transfer[int]):
         self._stream = MessageStream(self.round_trip)
         self._is_streaming = False
         self._range_end = into.position
-        # Largest offset received in the range, or the block before the range.
+        # Largest offset received of the current range; at first, the offset of the block before the range.
         self._latest_offset = into.position - LOG_BLOCK
         self._max_range_blocks = FIRST_RANGE
         self._requested_blocks = 0  # number of requested blocks of the current range
@@ -131,7 +130,7 @@ class LogDownload(Transfer[int]):
             self._latest_offset = offset
             self._received_blocks += 1
             self._is_streaming = offset + LOG_BLOCK < self._range_end
-        # If the log has grown since it was listed, PX4 sends a full block at the listed end. The rest is cut off.
+        # If the log has grown since it was listed, PX4 sends a full block at the listed end. The new bytes are dropped.
         length = min(message.count, self._size - offset)
         try:
             is_new = self._reassembly.add(offset, bytes(message.data[:length]))
@@ -179,7 +178,7 @@ class LogDownload(Transfer[int]):
 
     def _first_long_gap(self) -> tuple[int, int] | None:
         min_length = LONG_GAP * LOG_BLOCK
-        start, end = 0, 0  # of a gap: consecutive offsets in `gaps`, which has the offset of each missing block
+        start, end = 0, 0  # the current gap; `gaps` has the offset of each missing block
         for offset in self._reassembly.gaps:
             is_new_gap = offset != end
             if is_new_gap:
@@ -202,10 +201,10 @@ class LogDownload(Transfer[int]):
         self._request(start, self._range_end - start)
 
     def _adapt_range(self) -> None:
-        # Radios lose up to a third of the messages. If more than half are lost, a queue overflows, so ranges must be
-        # shorter. A range that was ended by a time-out is not judged, because the request or the link may have failed.
+        # After a time-out, the range proves nothing, because the request or the link may have failed.
         if self._stream.failures or not self._requested_blocks:
             return
+        # Radios lose up to a third of the messages. If more than half are lost, a queue overflows.
         if self._received_blocks < self._requested_blocks / 2:
             self._max_range_blocks = max(self._max_range_blocks // 2, MIN_RANGE)
         elif self._requested_blocks >= self._max_range_blocks and self._stream.interval_s:
@@ -226,7 +225,7 @@ class LogDownload(Transfer[int]):
 
 
 class LogStop(Transfer[None]):
-    """Sends LOG_REQUEST_END until the vehicle sends no more log data, because LOG_REQUEST_END is not acknowledged.
+    """Sends LOG_REQUEST_END, which is not acknowledged, until the vehicle sends no more log data.
 
     Args:
         is_sent: True if the caller itself makes the first transmission.
@@ -276,7 +275,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     Args:
         first_id: the id of this autopilot's oldest log.
-        max_unanswered: fail after this many requests without any entry; None: after ``idle_timeout_s``.
+        max_unanswered: number of unanswered requests after which to fail; None: fail only after ``idle_timeout_s``.
     """
 
     expects: tuple[type[Message], ...] = (LogEntry,)
@@ -300,7 +299,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         self._entries: dict[int, LogEntry] = {}
         self._missing: dict[int, None] | None = None  # ids of the missing entries; None before the first entry
         self._stream = MessageStream(self.round_trip)
-        self._previous_id = 0  # the id of the previously received entry or, after a request, the first requested id
+        self._previous_id = 0  # id of the latest entry, or the first requested id if no entry has followed the request
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -321,8 +320,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-        # Entries arrive in the order of their ids. After an entry with a larger id, the missing ones only arrive after
-        # a new request.
+        # Entries arrive in the order of their ids. All missing ones precede this entry, so they are requested again.
         elif message.id > next(reversed(self._missing)):  # the largest missing id
             self._request_missing(now)
         self._set_deadline()

@@ -48,10 +48,11 @@ class DownloadResult(Snapshot):
 class MissionDownload(MissionExchange[DownloadResult]):
     """Downloads a plan: sends MISSION_REQUEST_LIST, then a request for every item, then MISSION_ACK.
 
-    ``window`` is the number of requests in flight. It must be 1 for PX4, which aborts with ERROR unless a request is
-    for the next item or the previous one. ArduPilot answers requests in any order, so only missing items are requested
-    again. ``only`` restricts the download to these items. ``supports_int`` is False for a vehicle that has no
-    MISSION_ITEM_INT.
+    Args:
+        window: the number of requests in flight. It must be 1 for PX4, which answers a request out of sequence with
+            ERROR and aborts.
+        only: the indices of the items to download; None for all.
+        supports_int: False if the vehicle has no MISSION_ITEM_INT.
     """
 
     expects: tuple[type[Message], ...] = (MissionCount, MissionItemInt, MissionItem, MissionAck)
@@ -171,8 +172,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._reject(result)
 
     def _wait_while_busy(self, result: int, now: float) -> None:
-        # ArduPilot refuses a download while it waits for items of an upload. After 8 s of silence, it drops the upload,
-        # so the download is retried for a little longer.
+        # ArduPilot refuses a download while it waits for items of an upload. It drops the upload after 8 s of silence.
         if self._busy_until is None:
             self._busy_until = now + BUSY_TIMEOUT_S
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
@@ -184,8 +184,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self.deadline = now + BUSY_RETRY_INTERVAL_S
 
     def _restart_after_error(self, now: float) -> None:
-        # PX4 has dropped the transfer. The received items stay valid, but PX4 requires a request for each item in
-        # sequence again.
+        # PX4 has dropped the transfer, so each item must be requested again, in sequence.
         if self._restarts >= MAX_RESTARTS:
             self._reject(MavMissionResult.ERROR)
             return

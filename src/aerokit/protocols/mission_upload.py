@@ -33,8 +33,8 @@ IN_FLIGHT_ROUND_TRIPS = 0.8
 class UploadResult(Snapshot):
     """Result of an upload that was not refused.
 
-    ``is_confirmed`` is True if the vehicle has confirmed the plan. If it is False, all items were sent, but the answers
-    are ambiguous. The plan must then be read back, and ``item`` is the index of the first unconfirmed item.
+    ``is_confirmed`` is False if all items were sent, but the vehicle's answers do not prove that it has the plan. The
+    caller must then read the plan back. ``item`` is the index of the first item that the vehicle has not confirmed.
     ``opaque_id`` identifies the plan on the vehicle; 0 if the vehicle sends none.
     """
 
@@ -46,16 +46,18 @@ class UploadResult(Snapshot):
 class MissionUpload(MissionExchange[UploadResult]):
     """Uploads a plan: sends MISSION_COUNT, then the items that the vehicle requests.
 
-    If ``first`` is given, the upload begins with MISSION_WRITE_PARTIAL_LIST instead, and replaces as many
-    items as are given, from ``first`` on. ``supports_int`` is False if the vehicle does not accept MISSION_ITEM_INT.
+    A request for an item confirms all items before it. An unanswered item is repeated.
 
-    With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several items.
-    ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss. A
-    request confirms all items before the requested one. ArduPilot answers an item out of sequence with INVALID_SEQUENCE
-    and continues to wait; PX4 ignores the item and repeats its request every 0.25 s.
+    ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss.
+    ArduPilot answers an item out of sequence, e.g. a repeated one that it already has, with INVALID_SEQUENCE, and
+    continues to wait. PX4 ignores such an item, and repeats its request every 0.25 s.
 
-    An unanswered item is repeated. If the item had arrived, and only the request for the next item was lost, ArduPilot
-    answers the repetition with INVALID_SEQUENCE. The next item is then sent.
+    Args:
+        first: index of the first item to replace on the vehicle; None to replace the whole plan. If given, the upload
+            begins with MISSION_WRITE_PARTIAL_LIST.
+        window: maximum number of unconfirmed items. With more than one, items are sent before they are requested, so
+            that one round trip carries several.
+        supports_int: False if the vehicle does not accept MISSION_ITEM_INT.
     """
 
     expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
@@ -98,20 +100,20 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._sent_at: dict[int, float] = {}
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
-        self._error_at: float | None = None  # time of the first ERROR, which is answered by repeating an item
+        self._error_at: float | None = None  # time of the first ERROR since the last progress
         self._was_tail_repeated = False  # True if several items at the end were repeated; see `_send_window`
         self._attempt = 1
 
     @property
     def may_have_changed_items(self) -> bool:
         """True if the vehicle may have overwritten old items. False until the vehicle has requested an item."""
-        # If a partial upload fails when only its first item was sent, the vehicle refused it and has replaced nothing.
+        # If a partial upload fails after its first item, the vehicle has refused this item and replaced nothing.
         has_sent_only_first = self.is_partial and self._sent_end == self._first + 1
         return self.was_started and not has_sent_only_first
 
     @property
     def was_sent_completely(self) -> bool:
-        """True if all items were sent, so that the vehicle may have the whole plan even without a confirmation."""
+        """True if all items were sent. The vehicle may then have the whole plan even without a confirmation."""
         return self.was_started and self._sent_end == self._end
 
     # --------------------------------------------------------------------------------- events
@@ -145,10 +147,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         if not self._is_requesting:
             self._announce(now)
         elif self._sent_end < self._end:
-            may_send_ahead = self._window > 1  # Otherwise, no item is sent before the vehicle requests it.
+            may_send_ahead = self._window > 1  # With a window of 1, items are only sent on request.
             self._send_window(now, ahead=1 if may_send_ahead else 0)
         elif self._attempt % 2 == 0:
-            # The last item alone is enough if only the confirmation was lost: the vehicle then confirms again.
+            # If the confirmation was lost, the vehicle repeats it when it receives the last item again.
             self._send(self._end - 1, now)
         else:
             self._send_window(now)
@@ -177,7 +179,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             # The vehicle has restarted the transfer, or this is a delayed request.
             self._send(seq, now, unless_in_flight=True)
         elif seq in self._requested:
-            self._send_window(now)  # The item was lost, so it is requested again. The later ones were ignored.
+            self._send_window(now)  # The item was lost, and the vehicle has ignored the items after it.
         self._requested.add(seq)
         while self._sent_end < min(self._end, self._confirmed_end + self._window):
             self._send(self._sent_end, now)
@@ -204,8 +206,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
             if self._is_requesting and self._sent_end == self._end:
-                # Items may be sent before they are requested. Unless the vehicle has requested the last one, this may
-                # be a delayed answer to an earlier upload.
+                # The last item may be sent before the vehicle requests it. Until then, an ACCEPTED may be a delayed
+                # answer to an earlier upload.
                 was_last_requested = self._confirmed_end == self._end - 1
                 is_confirmed = was_last_requested and not self._was_tail_repeated
                 self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
@@ -229,17 +231,16 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_error(self, now: float) -> None:
         # ERROR need not mean that the upload has failed. PX4 also sends it when it is busy, when MISSION_COUNT arrives
-        # twice and, like ArduPilot, for an item after the end. An item is therefore repeated, and only another ERROR
-        # ends the upload. Within a round trip, an ERROR may answer an earlier message, so it is ignored.
+        # twice and, like ArduPilot, for an item after the end.
         if not self._is_requesting:
             self._wait_while_busy(now)
-        elif self._error_at is None:
+        elif self._error_at is None:  # Repeat an item. The upload ends only with another ERROR.
             self._error_at = now
             are_all_sent = self._sent_end == self._end
             seq = self._end - 1 if are_all_sent else self._confirmed_end
             self._send(seq, now, unless_in_flight=True)
             self._wait(now)
-        elif now - self._error_at >= self._in_flight_s:
+        elif now - self._error_at >= self._in_flight_s:  # An earlier ERROR may answer a message before the repetition.
             if self._sent_end == self._end:
                 # All items were sent, so the upload may be complete. The caller must read the plan back.
                 self._succeed(now, is_confirmed=False, opaque_id=0)
@@ -259,8 +260,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         """Begin again. ``result`` is the MAV_MISSION_RESULT to fail with if that is not possible."""
         if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
             return
-        # A partial upload does not begin again. The differences were computed from the vehicle's plan, which another
-        # station may have changed since.
+        # A partial upload does not begin again, because another station may have changed the vehicle's plan since.
         if self.is_partial or self._restarts >= MAX_RESTARTS:
             self._fail_as_refused(result)
             return
@@ -307,8 +307,8 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
         """Repeat the unconfirmed items, and send up to ``ahead`` further items."""
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # Items before the last one may be repeated, too. PX4 takes any repeated item for the mission's last item,
-            # and confirms the upload. This confirmation does not prove that PX4 has all items.
+            # PX4 may take a repetition of any of these items for the last item, and confirm the upload. A confirmation
+            # then does not prove that it has all items.
             self._was_tail_repeated = True
         # One more than the window, because the vehicle may already have the first unconfirmed item.
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)

@@ -203,11 +203,11 @@ MISSION_CURRENT_INTERVAL_S = 1.0
 class SetCurrentItem(Transfer[None]):
     """Sends MISSION_SET_CURRENT until MISSION_CURRENT confirms it, because there is no acknowledgement.
 
-    ``reported`` is the item last reported by the vehicle. If the vehicle moves from ``reported`` past the requested
-    item, this also counts as confirmation.
+    ``reported`` is the item last reported by the vehicle. If the vehicle has passed the requested item since then, this
+    also counts as confirmation.
 
-    With an ``order_status``, a retry waits for a HEARTBEAT that is newer than the last transmission. Retries stop when
-    ``order_status.end`` has a reason why this command must not be sent any more.
+    With an ``order_status``, a retry waits for a HEARTBEAT that is newer than the last transmission. Retries stop once
+    ``order_status.end`` has a text.
     """
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
@@ -236,7 +236,7 @@ class SetCurrentItem(Transfer[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Finish if MISSION_CURRENT reports our item, or changes to a later item because ours was passed."""
+        """Finish if MISSION_CURRENT shows that the vehicle has reached our item, or already passed it."""
         if not isinstance(message, MissionCurrent) or not self._is_from_target(message):
             return
         if message.seq == self._seq or self._has_passed(message.seq):
@@ -286,10 +286,11 @@ _INVERT = 0xFFFFFFFF
 def mission_checksum(items: Iterable[MissionItem]) -> int:
     """Compute the checksum with which PX4 identifies a plan.
 
-    The checksum is a CRC-32 with initial value 0 and without final inversion, over frame, command, autocontinue and the
-    seven numbers of each item; x and y must be whole numbers, as in MISSION_ITEM_INT. PX4 (since 1.15) reports it as
-    ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as ``mission_id``, ``fence_id`` and ``rally_points_id`` in
-    MISSION_CURRENT (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
+    The checksum is a CRC-32 with initial value 0 and without final inversion. It covers frame, command, autocontinue
+    and the seven numbers of each item. x and y must be whole numbers, as in MISSION_ITEM_INT.
+
+    PX4 (since 1.15) reports it as ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as ``mission_id``, ``fence_id``
+    and ``rally_points_id`` in MISSION_CURRENT (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
     """
     # zlib.crc32 inverts its start value and its result, so both are inverted once more.
     checksum = _INVERT

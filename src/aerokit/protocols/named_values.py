@@ -35,8 +35,8 @@ BY_NAME = -1
 PROBE, PROBE_INDEX = "", 0
 # A name without an answer counts as unknown once the probability that all its answers were lost is below this value.
 MAX_LOSS_PROBABILITY = 1e-4
-# A write ends with an unexpected value after this many answers with the same value. The value from before the write
-# needs more answers, because the vehicle may have sent some of them before the write arrived.
+# An unexpected value is the result of a write after this many equal answers. The value from before the write needs more
+# answers, because the vehicle may have sent some of them before the write arrived.
 ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
@@ -51,7 +51,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         super().__init__(target_system, target_component, **options)
         self._window: RequestWindow[int] = RequestWindow(self.round_trip, size=self.window_size)
         self._received: dict[int, ValueT] = {}  # the values by index
-        self._reported_counts: dict[int, int] = {}  # by index: number of parameters, from the message with the value
+        self._reported_counts: dict[int, int] = {}  # by index: the count in the message that had the value
         self._count: int | None = None
         self._next_index = 0  # next index that is expected in the stream
         self._is_streaming = False
@@ -109,10 +109,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self.deadline: float | None = min(at for at in times if at is not None)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
-        """Drop values received with another count, and return their indices.
-
-        After `MAX_REFRESHES` calls that dropped values, nothing is dropped any more.
-        """
+        """Drop values received with another count, at most `MAX_REFRESHES` times. Return their indices."""
         stale = tuple(index for index in range(count) if self._reported_counts[index] != count)
         if not stale or self._refreshes >= MAX_REFRESHES:
             return ()
@@ -210,10 +207,9 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
 
 class NamedReads(NamedRequests[ValueT]):
-    """Read some values by name.
+    """Read some values by name, and detect unknown names by a probe, a request that is always answered.
 
-    A name that is not answered results in a ParameterRejected if the component answered `PROBE`, a request that every
-    component with parameters answers.
+    If the component answers the probe, but a name repeatedly not, the result for the name is a ParameterRejected.
     """
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
@@ -260,7 +256,7 @@ class NamedReads(NamedRequests[ValueT]):
 
 
 class RepeatedAnswers(Generic[ValueT]):
-    """Collects consecutive answers to a write that report the same value, until they suffice to end the write."""
+    """Consecutive answers to a write that report the same value. Enough of them end the write."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same

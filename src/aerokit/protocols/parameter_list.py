@@ -22,19 +22,16 @@ __all__ = ["ParameterList", "merge_update"]
 
 
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
-    """Merge a PARAM_VALUE that is not part of a list into a known parameter.
-
-    If values are not sent bytewise, the known type and value are kept in two cases. The type may be wrong: ArduPilot
-    answers PARAM_SET of an integer with a float if the value is the default. The value may be rounded: an INT32 beyond
-    2**24 loses its last bits.
-    """
+    """Merge a PARAM_VALUE that is not part of a list into a known parameter."""
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
         is_whole = float(value).is_integer()
+        # If the value is the default, ArduPilot's answer to PARAM_SET reports an integer parameter as a float.
         if type_ is ParameterType.REAL32 and is_whole:
             value, type_ = int(value), known.type
+        # A float cannot hold the last bits of an INT32 beyond 2**24, so the known value is more exact.
         if same_value(float(known.value), float(value)):
-            value = known.value  # The reported value is equal, except for bits that a float cannot hold.
+            value = known.value
     index = known.index if reported.index is None else reported.index
     return Parameter(known.name, value, type_, default=known.default, index=index)
 
@@ -42,8 +39,8 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
 # Maximum seconds between two parts of a list. ArduPilot sends parts ten times a second, or once a second (MAV1_PARAMS).
 MAX_PART_INTERVAL_S = 1.1
 
-# Once at most this many values are missing, they are requested immediately, without waiting for the end of the stream.
-# A few values may then arrive twice, which costs little.
+# If at most this many values are left in the stream, its time-out is shorter. Values that are then requested too early
+# arrive twice, which costs little.
 NEAR_END = 20
 
 # The list's stream counts as started once it has sent this many values. The list is then not requested again.
@@ -59,10 +56,9 @@ MAX_REFUSALS = 2
 class ParameterList(ValueList[ParameterTable, Parameter]):
     """Download of all parameters: requests the list once, then missing indices as soon as a gap appears.
 
-    The vehicle reports the number of parameters. If this number changes during the transfer, indices shift: ArduPilot
-    reveals a group of parameters when the group is enabled, PX4 counts only the parameters in use. Unless each name
-    still has exactly one index, all values received before the change are requested again. Values with index 65535 are
-    not part of the list.
+    If the number of parameters changes during the transfer, indices shift: ArduPilot reveals a group of parameters when
+    the group is enabled, PX4 counts only the parameters in use. If names and indices then do not match one to one, all
+    values received before the change are requested again. Values with index 65535 are not part of the list.
 
     Raises from ``result()``:
         ParameterTimeout: no progress for ``idle_timeout_s`` seconds; ``missing`` has the missing indices.
@@ -119,8 +115,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._on_streamed_value(index, now)
         else:
             self._window.on_answer(index, now)
-        # An answer to a request delays the stream, so it restarts the time-out, too. Near the end of the list it does
-        # not, so that the last missing values are requested early.
+        # A value that we have requested delays the stream, so it also restarts the stream's time-out. Near the end of
+        # the list, only streamed values do, so that the last missing values are requested early.
         if self._is_streaming and (is_streamed or (is_requested and not self._is_near_end)):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
@@ -141,22 +137,22 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._parameters[reported.name] = merge_update(self._parameters[reported.name], reported, self._bytewise)
 
     def _on_refusal(self, message: ParamError) -> None:
-        # The error means that the list has become shorter. PX4 also sends it if it has no room for the value, but
-        # hardly ever `MAX_REFUSALS` times for one index. If later parameters were received, they no longer fit the
-        # count. `_finish_when_complete` then requests values again, and their answers correct the count. Only the index
-        # in the message is used, because PX4 does not fill in the name.
-        index = message.param_index
+        index = message.param_index  # PX4 does not fill in the name.
         if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._received:
             return
         self._refusals[index] = self._refusals.get(index, 0) + 1
+        # A single error does not prove that the list has become shorter: PX4 also sends it if it has no room for the
+        # value.
         if self._refusals[index] >= MAX_REFUSALS and self._count is not None:
             for nonexistent in range(index, self._count):
                 self._window.discard(nonexistent)
+            # If parameters beyond this count were received, `_finish_when_complete` requests values again, and the
+            # answers correct the count.
             self._count = min(self._count, index)
 
     def _record_count(self, count: int, *, is_streamed: bool) -> None:
-        # All messages of ArduPilot's stream report the count from the start of the stream, although the number of
-        # parameters may change meanwhile. A streamed count is therefore only compared with an earlier streamed count.
+        # ArduPilot reports the same count throughout a stream, even if the number of parameters changes meanwhile. A
+        # streamed count is therefore only compared with an earlier streamed count.
         if is_streamed:
             is_unchanged = count == self._count_in_stream
             self._count_in_stream = count
@@ -230,11 +226,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         if count is None or len(self._received) < count:
             return
         parameters = [self._received[index] for index in range(count) if index in self._received]
-        if len(parameters) != count:  # Some received indices are not below the count, which has decreased.
+        if len(parameters) != count:  # The count has decreased, and some received indices are beyond it.
             return
         names = {parameter.name for parameter in parameters}
         is_consistent = len(names) == count == len(self._parameters)  # Each name has exactly one index, and vice versa.
-        # Inconsistent values are the result if requesting them again cannot help.
+        # If nothing is left to request again, the result has the inconsistent values.
         if not is_consistent and self._drop_stale(count):
             self._must_request_missing = True
         else:

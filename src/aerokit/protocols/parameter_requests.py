@@ -92,13 +92,14 @@ READ_WINDOW = 20
 class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """Read some parameters by name. The result has one answer for each name.
 
-    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. ``probe=True`` detects such names. A name
-    that is not answered in time is requested again, together with index 0, which always exists. If index 0 is answered
-    several times, but the name never, the name's result is a ParameterRejected without a code.
-
-    ``alternatives`` maps names to other names of the same parameter. The vehicle has at most one of these names, so an
-    answer for one name makes the result of all others a ParameterRejected. ``possibly_stale`` maps names to old values
-    that a delayed message may still have. An old value is accepted only when it is received a second time.
+    Args:
+        probe: True to detect unknown names. ArduPilot, and PX4 before 1.17, do not answer requests for them. Therefore
+            the parameter with index 0 is requested as well. If it is answered, but a name repeatedly is not, the result
+            for the name is a ParameterRejected without a code.
+        possibly_stale: maps a name to its old value, which a delayed message may still report. If an answer has this
+            value, the parameter is read once more.
+        alternatives: maps a name to other names of the same parameter. Once one name is answered, the results for the
+            others are ParameterRejected errors.
     """
 
     unknown_text = "the vehicle has no parameter"
@@ -188,17 +189,19 @@ WRITE_WINDOW = 10
 class ParameterWrites(ParameterRequests):
     """Set some parameters. The result has the value that the vehicle reports for each parameter afterwards.
 
-    ``before`` has the values from before the writes, as far as they are known. The answers to a write are:
+    The next step depends on the answer to a write:
 
-    - The requested value with the requested type. The write is complete.
-    - No answer. The value is read.
-    - The value from before, or any value if that is unknown. The write may have been lost, so PARAM_SET is sent again.
-      If the same value is reported eight times in a row, and still after a second, it is the result.
-    - Another value. The vehicle has rounded or clamped the request, or another station has set the value. PARAM_SET is
-      not sent again, because it would undo the other station's change. A value reported twice in a row is the result.
+    - The requested value with the requested type: the write is complete.
+    - No answer: the value is read.
+    - The old value: PARAM_SET is sent again, because it may have been lost. If the vehicle reports the old value eight
+      times in a row, and still after a second, it is the result. While the old value is unknown, every other value is treated like this.
+    - Another value: the value is read again. PARAM_SET is not sent again, because it would undo the change if another
+      station has set the value. A value reported twice in a row is the result.
 
-    ``recent`` has the names that an earlier call has just written. Their first answer with the requested value may
-    belong to the earlier write, so the value is read once more.
+    Args:
+        before: the old values, as far as they are known.
+        recent: names that an earlier call has just written. An answer with the requested value may belong to that
+            write, so the value is read once more.
     """
 
     def __init__(

@@ -17,20 +17,20 @@ DEFAULT_SIZE = 20
 MAX_GROWTH = 5
 # An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
-# Once at most FEW_LEFT requests are left, each is sent twice, from attempt DUPLICATE_FROM_ATTEMPT on. Otherwise a
-# transfer over a bad radio would wait long for its last few requests.
+# The last FEW_LEFT requests are sent twice at each attempt from number DUPLICATE_FROM_ATTEMPT on. Otherwise a transfer
+# over a bad radio would wait long for them.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
-# The last few requests wait for at most two round trips or this time, whichever is longer. Repeating them costs little.
+# Maximum time-out of the last few requests, unless two round trips are longer. Repeating them costs little.
 FEW_LEFT_TIMEOUT_S = 0.5
-# Maximum seconds to wait for an answer. A queue that delayed the answers may be empty by then.
+# Maximum time-out, even if answers have taken longer so far: the queue that delayed them may be empty by then.
 MAX_TIMEOUT_S = 2.0
-# Answers arrive in the order of the requests. A request counts as lost once a request that was sent this many
-# transmissions later has been answered.
+# Answers arrive in the order of the requests. When a request is answered, all unanswered requests that were sent at
+# least this many transmissions before it count as lost.
 OVERTAKEN = 3
 
 
 class _Request:
-    """Times of a request's first and latest transmission, and their numbers among those of all requests."""
+    """A request's first and latest transmission: their times, and their numbers, counted over all requests."""
 
     __slots__ = ("attempts", "due_at", "first_at", "first_number", "last_number", "sent_at", "was_duplicated")
 
@@ -45,10 +45,11 @@ class _Request:
 
 
 class RequestWindow(Generic[KeyT]):
-    """Requests by key. Up to ``size`` may be in flight; this limit grows while answers do not become slower.
+    """Requests, each identified by a key, with a limit on the number in flight.
 
-    With ``duplicate_last``, once only a few requests are left, each is sent twice from its third attempt on. A request
-    is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
+    The limit is ``size`` at first, and grows while answers do not become slower. A request is repeated when its answer
+    is overdue (:class:`RoundTrip`), or when later requests were answered first. With ``duplicate_last``, the last few
+    requests are sent twice at each attempt from the third on.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:
@@ -58,15 +59,12 @@ class RequestWindow(Generic[KeyT]):
         self._fastest_s = math.inf
         self._duplicate_last = duplicate_last
         self._answered_at = -math.inf
-        self._silences = 0  # how many times in a row no request was answered in time
-        self._next_silence_at = -math.inf  # earliest time at which a further silence is counted
-        self._waiting: dict[KeyT, None] = {}
-        # Requests that were sent, and neither answered nor queued again, in the order in which they were sent.
-        self._in_flight: dict[KeyT, _Request] = {}
-        # All unanswered requests that were sent at least once, including overdue ones that wait to be sent again.
-        self._requests: dict[KeyT, _Request] = {}
-        # Maps a key that was answered after a repetition to the seconds from its first transmission to the answer.
-        # Until a second answer arrives, it is unknown which transmission was answered.
+        self._silences = 0  # number of consecutive time-outs without any answer
+        self._next_silence_at = -math.inf  # earliest time to increase `_silences`
+        self._waiting: dict[KeyT, None] = {}  # requests to send, in order
+        self._in_flight: dict[KeyT, _Request] = {}  # in the order in which they were sent
+        self._requests: dict[KeyT, _Request] = {}  # requests in flight, or waiting to be sent again
+        # By key of a repeated request: seconds from its first transmission to its answer. See `_on_second_answer`.
         self._ambiguous: dict[KeyT, float] = {}
         self._sent_count = 0
 
@@ -122,7 +120,7 @@ class RequestWindow(Generic[KeyT]):
             self._ambiguous[key] = now - request.first_at
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
-            # The first transmission of the answered request counts, because the answer may belong to it.
+            # The answer may belong to the first transmission, so only requests sent before that one count as lost.
             if request_in_flight.last_number > request.first_number - overtaken:
                 break  # All further requests were sent later.
             lost.append(key_in_flight)
@@ -196,8 +194,8 @@ class RequestWindow(Generic[KeyT]):
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
     def _on_second_answer(self, key: KeyT) -> None:
-        # Two answers mean that the first transmission was not lost, but repeated too early. The first answer therefore
-        # belongs to the first transmission, and this longer round trip makes the time-out longer.
+        # Two answers mean that nothing was lost, and the request was repeated too early. The first answer therefore
+        # belongs to the first transmission. Its round trip makes the time-out longer.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

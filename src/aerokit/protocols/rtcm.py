@@ -47,7 +47,7 @@ def message_number(frame: bytes) -> int | None:
 
 
 def _frame_size(data: bytes, begin: int) -> int | None:
-    """Return the size of the frame at ``begin``, or None if no frame begins there. Needs three bytes."""
+    """Return the size of the frame at ``begin``, or None if no frame begins there. Reads up to three bytes."""
     # After the preamble, six reserved bits must be zero. The length follows in ten bits.
     if data[begin] != PREAMBLE or data[begin + 1] & 0xFC:
         return None

@@ -149,7 +149,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "component_twins": ("aerokit.onboard.opening.component",),
 }
 
-# Maps each page to the hand-written function (module and name) that opens these contexts on a loop thread.
+# Maps each page to the hand-written function (module and name) that opens such a context on a loop thread.
 OPENERS = {
     "twins": ("aerokit.sync.blocks", "opened"),
     "fleet_twins": ("aerokit.sync.fleet_blocks", "opened_fleet"),
@@ -192,7 +192,7 @@ class Page:
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
         """Add the imports for an expression. Without ``at_run_time``, they are for type checkers only.
 
-        ``modules`` import the names. Names that none of them imports are defined in the first one.
+        The names are those imported by one of ``modules``, or defined in the first of them.
         """
         if node is None:
             return
@@ -387,7 +387,7 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
 def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
     imported = sorted((name for name_module, name in names if name_module == module and name), key=_by_kind)
     plain_names = [name for name in imported if " as " not in name]
-    # As in ruff's format, each name with "as" has its own statement. The keys are the first imported names.
+    # As in ruff's format, each name with "as" has its own statement. Each key is the first name of its statement.
     statements = {name: f"{indent}from {module} import {name}\n" for name in imported if name not in plain_names}
     if plain_names:
         statement = f"{indent}from {module} import {', '.join(plain_names)}\n"

@@ -86,16 +86,16 @@ class LoopThread:
         return self._run(False, False, function, *args, **kwargs)
 
     def run_shielded(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Like :meth:`run`, but wait without limit for the end of the function after Ctrl-C.
+        """Like :meth:`run`, but after Ctrl-C wait without limit for the end of the function.
 
-        The function must shield what Ctrl-C must not cancel. A second Ctrl-C ends the wait.
+        Ctrl-C still cancels the function, which must itself shield its clean-up. A second Ctrl-C ends the wait.
         """
         return self._run(True, True, function, *args, **kwargs)
 
     def run_exit(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Like :meth:`run`, for the exit of a block.
+        """Like :meth:`run`, but start the function even if Ctrl-C came first. Used for the exit of a block.
 
-        The function starts even after Ctrl-C, which then cancels it.
+        Ctrl-C then cancels the function after its start.
         """
         return self._run(False, True, function, *args, **kwargs)
 
@@ -108,9 +108,10 @@ class LoopThread:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run a function. With ``must_start``, it is started even after Ctrl-C.
+        """Run a function, and cancel it after Ctrl-C.
 
-        After Ctrl-C, the function is cancelled. With ``is_shielded``, its end is awaited without limit.
+        With ``must_start``, it is started even if Ctrl-C came first. With ``is_shielded``, the wait for its end has no
+        limit.
         """
         call: _Call[T] | None = None
         try:
@@ -128,7 +129,7 @@ class LoopThread:
                 self._cancel(call)  # A shielded function shields what must not be cancelled.
                 wait_s = SIGNAL_CHECK_INTERVAL_S if is_shielded else INTERRUPTED_CALL_TIMEOUT_S
                 while call.is_scheduled and not call.wait(wait_s):
-                    may_wait_on = is_shielded and self._thread.is_alive()  # Only clean-up is awaited without limit.
+                    may_wait_on = is_shielded and self._thread.is_alive()  # The wait for clean-up has no limit.
                     if not may_wait_on:
                         break
                 # An error of the clean-up function must not be lost, so it becomes the cause of the raised exception.
@@ -347,8 +348,8 @@ class _Calls:
         call.has_started = True
         task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        # `finish` changes nothing if `run` has finished the call. It is needed for a task that was cancelled before its
-        # first step.
+        # A task that is cancelled before its first step does not finish its call, so `finish` is called here. After
+        # `run`, this has no effect.
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:

@@ -14,7 +14,7 @@ T = TypeVar("T")
 class ThreadFuture(Generic[T]):
     """A result or an error that another thread sets. Waiting for it is safe for Ctrl-C at every moment.
 
-    It uses a plain lock. ``threading.Condition``, and with it ``Event`` and ``Future``, is Python code that Ctrl-C can
+    It uses a plain lock. ``Event`` and ``Future`` use ``threading.Condition``, which is Python code that Ctrl-C can
     interrupt between any two lines: KeyboardInterrupt then becomes ``RuntimeError: release unlocked lock``, or a lock
     that the other thread needs stays acquired.
     """
@@ -55,7 +55,7 @@ class ThreadFuture(Generic[T]):
     def result(self) -> T:
         """Return the result, or raise the error. An error is raised only once.
 
-        Raises LookupError if there is neither.
+        Raises LookupError if there is no result and no error.
         """
         error = self.pop_exception()
         if error is not None:

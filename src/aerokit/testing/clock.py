@@ -48,7 +48,7 @@ T = TypeVar("T")
 # The selector is polled at least once in this many steps. A step is one iteration of the loop or one run of an event
 # source.
 _POLL_EVERY = 64
-# With more timers than this, cancelled timers are discarded if they are more than half of the timers.
+# If there are more timers than this, and more than half are cancelled, the cancelled timers are discarded.
 _MANY_TIMERS = 100
 
 DEADLOCK_TIMEOUT_S = 10.0
@@ -116,7 +116,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # If a poll is due, the next iteration polls. Without a timer, it runs the event sources again.
+            # The next iteration polls if that is due. If there is no timer, it runs the event sources again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             # Otherwise, the next event is a timer.

@@ -69,11 +69,12 @@ class Air:
 
 
 class FaultyPath:
-    """Applies faults to one direction of a link. Equal models, seeds, frames and times produce equal results.
+    """Applies faults to one direction of a link. The same model, seed, frames and times produce the same faults.
 
-    ``frames`` and ``bytes`` count everything that was sent. ``overflowed`` counts the frames that did not fit into the
-    queue of `FaultModel.queue_bytes`, ``lost`` the other frames that did not arrive, including those during outages.
-    ``duplicated``, ``reordered`` and ``corrupted`` count the arriving frames with these faults.
+    - ``frames``, ``bytes``: everything that was sent.
+    - ``overflowed``: frames that did not fit into the queue of `FaultModel.queue_bytes`.
+    - ``lost``: other frames that did not arrive, including those during outages.
+    - ``duplicated``, ``reordered``, ``corrupted``: arriving frames with these faults.
     """
 
     frames: int

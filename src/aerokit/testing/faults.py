@@ -113,7 +113,7 @@ class FaultInjector:
     def _set(
         self, name: str, value: object, after_s: float, for_s: float | None = None, *, healthy_value: object = False
     ) -> None:
-        """Set an attribute of `Faults` after ``after_s``. After ``for_s`` more, set it to ``healthy_value``."""
+        """Set an attribute of `Faults` after ``after_s``, and reset it to ``healthy_value`` after ``for_s`` more."""
         faults = self.all
         end_s = None if for_s is None else after_s + _duration(for_s)
         self._schedule(partial(setattr, faults, name, value), after_s)

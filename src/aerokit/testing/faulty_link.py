@@ -274,7 +274,7 @@ class FaultyLink(Link):
         if self._incoming_path is not None:
             self._incoming_path.close()
         in_flight = self._in_flight
-        if in_flight is None or in_flight.loop.is_closed() or in_flight.is_empty:  # Nothing can be delivered any more.
+        if in_flight is None or in_flight.loop.is_closed() or in_flight.is_empty:  # There is nothing left to deliver.
             self.link.close()
             return
         self._drained.clear()

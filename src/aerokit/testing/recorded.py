@@ -92,7 +92,7 @@ class RecordedParameters(ParameterProtocolServer):
         if name not in self.names:
             self._refuse(request, index=-1, channel=channel)  # -1 because the request has no index
             return
-        # If the recording has no successful write of the parameter, the vehicle keeps and sends the present value.
+        # Without a successful write in the recording, the parameter keeps its value. The answer is the present value.
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
         self.send(name, self.names.index(name), None)
@@ -182,7 +182,8 @@ class RecordedMissions(MissionServer):
 
 def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, wants_float: bool) -> AnyItem:
     """Convert a recorded item to MISSION_ITEM (``wants_float``) or MISSION_ITEM_INT."""
-    # Degrees for global frames, metres for local ones. In MAV_FRAME_MISSION, x and y are neither.
+    # In MISSION_ITEM_INT, x and y are degrees times 1e7, in local frames metres times 1e4, and in MAV_FRAME_MISSION
+    # numbers without a scale.
     scale = 1.0 if item.frame == MavFrame.MISSION else 1e4 if item.frame in LOCAL_FRAMES else 1e7
     was_float = isinstance(item, m.MissionItem)
     converted = item_from(item)  # with x and y as recorded
@@ -240,7 +241,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        # Number of answers sent from each list of recorded answers. The key has the `id()`s of the answers in the list.
+        # Number of answers sent from each list of recorded answers. The `id()`s of its answers identify a list.
         self._answered_counts: dict[tuple[int, ...], int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""
@@ -325,9 +326,9 @@ class RecordedVehicle(SimulatedVehicle):
         return None  # The acknowledgements were recorded, so no further one is sent.
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
-        """Return the recorded answer to a command, or None.
+        """Return the next recorded answer to a command; None if none was recorded.
 
-        Equal commands get successive answers. The last answer repeats.
+        After the last answer, the last answer is returned again.
         """
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
@@ -340,7 +341,6 @@ class RecordedVehicle(SimulatedVehicle):
             candidates = answers
         if not candidates:
             return None
-        # Commands with the same candidates get them in turn.
         list_id = tuple(map(id, candidates))
         count = self._answered_counts.get(list_id, 0)
         self._answered_counts[list_id] = count + 1

@@ -117,8 +117,8 @@ def hosted_flight(
     """Serve a vehicle on an address while the block runs. ``options`` are the options of the vehicle.
 
     The vehicle's timeouts are scaled as by `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind
-    or address, and LinkOpenError if the address cannot be opened. The end of the block raises the exception with which
-    the vehicle has failed.
+    or address, and LinkOpenError if the address cannot be opened. If the simulated vehicle has raised an exception, the
+    end of the block raises it.
     """
     from anyio.from_thread import start_blocking_portal
 
@@ -143,7 +143,7 @@ def hosted_flight(
         try:
             yield flight
         finally:
-            portal.call(scheduler.record)  # Append the final points, because the tracks are not refreshed any more.
+            portal.call(scheduler.record)  # Append the last points of the tracks before refreshing ends.
             scheduler.refresh_with(None)
             with flight._raising_once():
                 serving.__exit__(None, None, None)

@@ -65,7 +65,7 @@ class FlightScheduler(SimulatedVehicle):
     def do_when(self, condition: Callable[[], bool], action: Callable[[], None]) -> None:
         """Run an action once, as soon as a condition is true.
 
-        It is checked ten times per simulated second.
+        The condition is checked ten times per simulated second.
         """
         if condition():
             action()

@@ -131,7 +131,7 @@ class Track(Sequence[TrackPoint]):
         return sum(math.dist(start, end) for start, end in pairwise(self.local()))
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return for each point metres north and east of ``origin``, by default home, and metres above home."""
+        """Return each point as metres north and east of ``origin`` (default: home), and metres above home."""
         offset_of = metres_from(self.home if origin is None else origin)
         return [(*offset_of(point), point.altitude_m) for point in self]
 
@@ -261,7 +261,7 @@ class Track(Sequence[TrackPoint]):
         return max(self, key=lambda point: point.speed_m_s)
 
     def _farthest(self, center: Position) -> tuple[float, TrackPoint]:
-        """Return the maximum horizontal distance from a position in metres, and the point of the track."""
+        """Return the maximum horizontal distance from a position in metres, and the farthest point."""
         self._check_not_empty()
         offset_of = metres_from(center)
         farthest = max(self, key=lambda point: math.hypot(*offset_of(point)))

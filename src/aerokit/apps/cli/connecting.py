@@ -176,8 +176,8 @@ def add_action(
 async def is_declined(options: argparse.Namespace, action: str, question: str, outcome: str) -> bool:
     """Ask the user a question; return True if the answer is no.
 
-    With ``--yes``, the question is not asked. The answer is no if stdin is not a terminal. ``outcome`` is the last word
-    of the text after a no: "nothing was sent".
+    With ``--yes``, the question is not asked. The answer is no if stdin is not a terminal. ``outcome`` ends the text
+    that is printed after a no, such as "sent" in "nothing was sent".
     """
     if options.yes or (is_interactive() and await confirm(question)):
         return False

@@ -166,8 +166,7 @@ class _SquareFlight(SupervisedFlight):
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # A party that has changed the mode may also have commanded a hold or a landing. These modes then do not show
-        # that this program has control.
+        # After another party has changed the mode, a hold or a landing may be that party's command, too.
         return ("take_off", "setpoint") if self._was_overruled else ("take_off", "setpoint", "hold", "land")
 
     async def _after_failure(self, error: Exception) -> int:

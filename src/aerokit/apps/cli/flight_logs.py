@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-# Maps suffixes of files to what `Conversion.written` counts. In other files, it counts rows. An .mcap has more messages
-# than the log has entries, because it also has a message for each changed state.
+# What `Conversion.written` counts, by the suffix of the file; rows for other suffixes. An .mcap has more messages than
+# the log has entries, because it also has a message for each changed state.
 _WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 _REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 

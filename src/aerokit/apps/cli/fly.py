@@ -226,9 +226,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_record(command)
     add_vehicle(command)
     add_json(command)
-    # `run_fly` must know whether --connect is given, so it fills in the default address itself. argparse has no public
-    # list of a group's options.
-    command.set_defaults(run=run_fly, connect=None, simulation_actions=tuple(simulated._group_actions))
+    # `run_fly` must know whether --connect is given, so it fills in the default address itself.
+    command.set_defaults(run=run_fly, connect=None)
+    # argparse has no public list of a group's options.
+    command.set_defaults(simulation_actions=tuple(simulated._group_actions))
 
 
 async def run_fly(options: argparse.Namespace) -> int:
@@ -238,7 +239,7 @@ async def run_fly(options: argparse.Namespace) -> int:
         items = getattr(plan, part).to_items()
         if items:
             emit_items(options, part, items, "in the file")
-    # `_connect_and_fly` appends its flight to `flights`, so that its state is known here after an interrupt.
+    # `_connect_and_fly` appends the flight, so that the flight's state is known here after an interrupt.
     flights: list[PlanFlight] = []
     interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):
@@ -287,8 +288,8 @@ async def _connect_and_fly(
         async with report.running():
             try:
                 code = await flight.fly()
-                # The recording of a real vehicle continues until the end of the flight. If a simulated mission ended in
-                # the air, nothing would land the vehicle, and the recording would not end.
+                # The recording of a real vehicle continues until the end of the flight. A simulated vehicle may stay in
+                # the air after its mission, because nobody lands it, so its recording might not end.
                 continues_recording = code == DONE and not options.sim
             except AerokitError as flight_error:  # raised again below, after the summary
                 error = flight_error

@@ -168,14 +168,14 @@ class Parser(argparse.ArgumentParser):
             if problem := misplaced_address(self, args):
                 self.error(problem)
         namespace, unknown = super().parse_known_args(args, namespace)
-        # argparse would leave this to the top-level parser, whose usage does not show the options of the subcommand.
+        # argparse would print the usage of the top-level parser, which does not show the options of the subcommand.
         if unknown:
             self._exit_unrecognized(unknown)
         return namespace, unknown
 
     def _check_option_names(self, args: Sequence[str]) -> None:
         # Report unknown options before argparse does, because argparse would take the value after an unknown option for
-        # a positional argument. --connect is skipped, because misplaced_address() reports the right command line.
+        # a positional argument. --connect is left to misplaced_address(), which prints the right command line.
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
@@ -278,8 +278,8 @@ def _report(error: BaseException, options: argparse.Namespace) -> int:
 def make_parser(only: str | None = None) -> argparse.ArgumentParser:
     """Make the parser for the command line.
 
-    Only the arguments of the command ``only`` are added, because importing all modules is slow. "" adds those of no
-    command, and None those of all commands.
+    Only the arguments of the command ``only`` are added, because importing all modules is slow. ``only`` is "" for no
+    command, and None for all commands.
     """
     from aerokit import __version__
 

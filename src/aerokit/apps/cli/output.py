@@ -316,10 +316,9 @@ def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Check that a recording can be written, and remove it after the block if it is empty.
+    """Check that a recording can be written, and remove the file after the block if it is new and empty.
 
-    A file that existed before the block is never removed. None stands for no recording. Raises PermissionError if the
-    folder is not writable.
+    None stands for no recording. Raises PermissionError if the folder is not writable.
     """
     if path is None:
         yield

@@ -114,7 +114,7 @@ async def _list(options: argparse.Namespace) -> int:
 def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle) -> ParameterTable:
     """Return the parameters that differ from their default.
 
-    Defaults that the vehicle has not reported are those of the metadata. Raises ValueUnknownError if no default is
+    If the vehicle has not reported a default, that of the metadata counts. Raises ValueUnknownError if no default is
     known.
     """
     if metadata is not None:

@@ -165,7 +165,7 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
 
 
 def _server_class(uvicorn: Any) -> Any:
-    """Return a uvicorn server class without signal handlers. A server calls ``on_started`` with its port."""
+    """Return a uvicorn server class without signal handlers, which calls its ``on_started`` with the port."""
 
     class Server(uvicorn.Server):  # type: ignore[misc]
         @contextmanager

@@ -251,7 +251,7 @@ class SupervisedFlight(ABC):
     def _is_in_our_mode(self) -> bool:
         vehicle = self._vehicle
         if not (self._has_changed_mode or self._has_left_mode) and vehicle.mode_name in self._modes_armed_in:
-            return self._is_armed_on_ground  # This program has not taken off, so a pilot flies a vehicle in the air.
+            return self._is_armed_on_ground  # This program has not taken off. In the air, a pilot is flying.
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 

@@ -62,8 +62,8 @@ class BrokerAddress(Snapshot):
 def parse_broker(text: str, *schemes: str) -> BrokerAddress:
     """Parse the address of a broker.
 
-    The allowed schemes are by default ``mqtt`` and ``mqtts``. Raises InvalidArgument if the address is invalid. Its
-    text never shows a password.
+    The allowed schemes are by default ``mqtt`` and ``mqtts``. Raises InvalidArgument if the address is invalid; the
+    error text never shows a password.
     """
     allowed = schemes or tuple(PORTS)
     scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"

@@ -257,8 +257,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One HTTP method of one path.
 
-    ``name`` is the operationId. An operation that gives an order has its type in ``order``. An operation that only
-    checks the arguments of an order has the order's type in ``body_type``.
+    ``name`` is the operationId. ``order`` is the type of the order that the operation gives. ``body_type`` is the type
+    of an order whose arguments the operation only checks.
     """
 
     method: str
@@ -358,7 +358,7 @@ class HttpApi:
 
     async def _vehicle(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
-        # A vehicle may report the names of its modes, and may have more of them than its firmware has by default.
+        # A vehicle may report modes that its firmware does not have by default.
         names = dict.fromkeys([*vehicle.autopilot.modes.names, *vehicle.telemetry.mode_names.values()])
         unselectable = vehicle.autopilot.unselectable_modes
         return json_response({**overview(vehicle), "modes": [name for name in names if name not in unselectable]})
@@ -399,7 +399,7 @@ class HttpApi:
         return plan, to_jsonable(vehicle.connection.now() - read_at)
 
     def _on_message(self, message: dict[str, Any]) -> None:
-        # Stored plans are dropped even if the upload failed, because it may have changed some of them.
+        # Drop the stored plans even if the upload failed, because it may have changed plans on the vehicle.
         if message["type"] == "order" and message["order"] == "mission/upload":
             for vehicle, kind in tuple(self._plans):
                 if vehicle.system_id == message["system_id"]:

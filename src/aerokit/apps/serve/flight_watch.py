@@ -51,12 +51,13 @@ _IN_AIR = (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING
 
 
 class FlightWatch:
-    """Observes the velocity, the landed state and the arming of one vehicle. Sends nothing.
+    """Detects a crash of one vehicle, and disarming without an order. Sends nothing.
 
-    ``crash`` is strict: a flying vehicle must not count as crashed, because the page offers to stop the motors of a
-    crashed vehicle. A vehicle has crashed if ``ImpactDetector`` reports an impact, after which the vehicle does not
-    move. In addition, one of these must be true: the vehicle is disarmed; it reports that it is on the ground; it is
-    near the altitude of home, and the impact stopped it more abruptly than its motors could.
+    A vehicle has crashed if ``ImpactDetector`` reports an impact, and the vehicle does not move afterwards. One of
+    these must also be true: the vehicle is disarmed; it reports that it is on the ground; or it is near the altitude
+    of home, and the impact stopped it more abruptly than its motors could.
+
+    The conditions are strict, because the page offers to stop the motors of a crashed vehicle.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -66,7 +67,7 @@ class FlightWatch:
         # The last descent at IMPACT_M_S or faster.
         self._last_sink_at = -math.inf
         self._last_sink_m_s = 0.0
-        # The last impact; None if there was none. It is dismissed once it is certain that it was no crash.
+        # The last impact; None if there was none. An impact that was certainly no crash is dismissed.
         self._impact_at: float | None = None
         self._impact_height_m: float | None = None
         self._was_sudden_stop = False

@@ -60,7 +60,7 @@ class AccessControl:
     def check(self, headers: Headers, *, is_order: bool = False, needs_token: bool = False) -> None:
         """Raise HttpProblem 401 or 403 if the request is not allowed.
 
-        With ``needs_token``, a request needs the token even if reading does not. Orders always need it.
+        With ``needs_token``, a request needs the token even if reading is open to all. Orders always need it.
         """
         if is_order and self.read_only:
             raise HttpProblem(403, "ReadOnly", "this server is read-only and accepts no orders; nothing was sent")
@@ -110,8 +110,8 @@ def content_policy(tiles: str | None) -> str:
 class SecurityMiddleware:
     """ASGI middleware that rejects foreign hosts and origins, and adds security headers to every response.
 
-    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``, which prevents DNS rebinding. An
-    Origin, if a browser sends one, must be this server, so that pages of other sites cannot make requests.
+    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``. This prevents DNS rebinding. If a
+    browser sends an Origin, it must be this server. Pages of other sites therefore cannot make requests.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], tile_url: str | None) -> None:
@@ -246,9 +246,10 @@ class _HttpConnection(H11Protocol):
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
-    """Class for the argument ``ws`` of `uvicorn.Config`: marks a handshake as complete when the app has refused it.
+    """uvicorn's WebSocket connection with a correction, for the argument ``ws`` of `uvicorn.Config`.
 
-    uvicorn 0.35 to 0.54 do not mark it, and log the error "ASGI callable returned without completing handshake".
+    uvicorn 0.35 to 0.54 do not mark a handshake as complete when the app has refused it, and then log the error "ASGI
+    callable returned without completing handshake".
     """
 
     async def send(self, message: Any) -> None:

@@ -128,7 +128,7 @@ async def _pause(vehicle: Vehicle, _: dict[str, Any]) -> object:
 
 
 async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
-    # If its mission is finished, an ArduCopter on the ground would take off and fly the mission again.
+    # An ArduCopter on the ground whose mission is finished would take off and fly the mission again.
     is_on_ground = is_reported_on_ground(vehicle, max_age_s=_LANDED_STATE_MAX_AGE_S)
     if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in SURFACE_TYPES:
         raise OperationRejected(
@@ -144,10 +144,7 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Met
 
 
 def parameter_order(metadata: Metadata | None) -> OrderType:
-    """Return the order type that sets a parameter.
-
-    The result of such an order has a note if the value's range was not checked.
-    """
+    """Return the order type that sets a parameter. Its result has a note if the value's range was not checked."""
     return replace(SET_PARAMETER, run=partial(_set_parameter, metadata=metadata))
 
 
@@ -171,7 +168,7 @@ async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
 def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
     """Return the name, the text and the plan of a request body.
 
-    The field ``plan`` has a .plan as JSON object, or the text of a file. Raises the errors of `parse_plan_text`.
+    The field ``plan`` is the JSON object of a .plan, or the text of a file. Raises the errors of `parse_plan_text`.
     """
     name = values.get("name")
     name = name[:100] if isinstance(name, str) else "plan"
@@ -316,7 +313,7 @@ class OrderRecord:
 
 
 class OrderRunner:
-    """Runs each order once, in a task of the server, so that an order continues when its client disconnects."""
+    """Runs each order once, in a task of its own. An order continues when its client disconnects."""
 
     def __init__(self, served: ServedVehicles) -> None:
         self._served = served
@@ -457,10 +454,7 @@ class OrderRunner:
         self._publish(record)
 
     def _replaced_by(self, record: OrderRecord, error: Exception) -> str | None:
-        """Return the key of the newest motion order that replaced this one, or None.
-
-        ``error`` is the error with which this order ended.
-        """
+        """Return the key of the newest later motion order if ``error`` says that this order was replaced; else None."""
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
         newest_key = None

@@ -46,7 +46,7 @@ BODY_TIMEOUT_S = 10.0
 
 
 class HttpProblem(Exception):
-    """A request failed. ``kind`` identifies the problem for programs: it is the value of ``error`` in the response."""
+    """A request failed. ``kind`` is the value of ``error`` in the response, by which programs know the problem."""
 
     def __init__(self, status: int, kind: str, text: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(text)

@@ -52,8 +52,8 @@ TRACK_GAP_S = 3.0
 class ServedVehicles:
     """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
 
-    Requests nothing but the return altitude, once, and the reasons for not arming. The reasons are requested when a
-    disarmed vehicle begins to report failing checks, and again when the failing sensors change.
+    Requests the return altitude of each vehicle once. Requests the reasons for not arming when a disarmed vehicle
+    begins to report failing checks, and again when the failing sensors change.
 
     ``source`` is a connection (its vehicles are added as they appear), one vehicle, or a mapping from system id to
     vehicle, which may grow.
@@ -223,7 +223,7 @@ class ServedVehicles:
             **overview(vehicle),
             "missing_for_flight": missing,
             "not_armable": not_armable(vehicle, missing),
-            # For a silent vehicle, `self.crash` is None, because it allows orders. The page shows the last known crash.
+            # `self.crash` allows orders, so it is None for a silent vehicle. The page shows the last known crash.
             "crash": self.crash(vehicle) if is_connected else watch.crash,
             "disarming": watch.disarming,
             "disarm_parameter": watch.disarm_parameter,
@@ -232,8 +232,8 @@ class ServedVehicles:
             "return_altitude_m": known_return_altitude(vehicle.parameters, vehicle.autopilot, is_vtol=vehicle.is_vtol),
             "failsafe": ground_station_failsafe(vehicle),
             "active_failsafe": active_failsafe(vehicle),
-            # An index in the plan, which does not contain home. The state `mission_current` is the item number in
-            # MAVLink, where ArduPilot's item 0 is home.
+            # This index does not count home. The state `mission_current` is the item number in MAVLink, where
+            # ArduPilot's item 0 is home.
             "mission_item": vehicle.mission.current.latest,
             "mission_items": vehicle.mission.count.latest,
             "mission_version": list(vehicle.mission._version),

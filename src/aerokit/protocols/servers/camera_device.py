@@ -100,7 +100,7 @@ class CameraDevice:
         raise NotImplementedError
 
     def failed_shot(self) -> Shot:
-        """Return a `Shot` for an image that could not be taken; the caller adds its index and result."""
+        """Return the `Shot` of an image that could not be taken."""
         return partial(
             CameraImageCaptured, time_boot_ms=self.host.time_boot_ms, time_utc=0, camera_id=0, lat=0, lon=0, alt=0,
             relative_alt=0, q=UNKNOWN_ATTITUDE, file_url="",
@@ -167,7 +167,7 @@ class Captures:
         self.images: list[CameraImageCaptured] = []
         """The image log: the latest images since it was cleared, at most ``max_images``."""
         self.dropped_count: int = 0
-        """Number of older images that the log has dropped. The log's first image has this image index."""
+        """Number of images that the log has dropped. It is also the index of the first image in the log."""
         self.interval_s: float = 0.0
         """Seconds between two images of the current series."""
         self._remaining = 0  # number of images of the series that are still to be taken; -1 if unlimited
@@ -198,7 +198,7 @@ class Captures:
     def take_series(self, interval_s: float, count: int) -> None:
         """Take ``count`` images, one every ``interval_s`` seconds.
 
-        The first image is taken at once. A count of 0 means until `stop`.
+        The first image is taken at once. With a count of 0, the series continues until `stop`.
         """
         self.interval_s = interval_s if count != 1 else 0.0
         self._remaining = count or _UNLIMITED
@@ -220,7 +220,7 @@ class Captures:
         return self.dropped_count + len(self.images)
 
     def between(self, first: int, last: int | None) -> list[CameraImageCaptured]:
-        """Return the logged images with the indices ``first`` to ``last``. None means to the newest image."""
+        """Return the logged images from index ``first`` to ``last``, or to the newest image if ``last`` is None."""
         end = None if last is None else max(0, last + 1 - self.dropped_count)
         return self.images[max(0, first - self.dropped_count) : end]
 
@@ -264,10 +264,7 @@ class Captures:
             self._begin_image(series)
 
     def record(self, status_interval_s: float) -> None:
-        """Register the start of a video, and send CAMERA_CAPTURE_STATUS at this interval.
-
-        An interval of 0 sends it only once, now.
-        """
+        """Register the start of a video. Send CAMERA_CAPTURE_STATUS now and, if the interval is not 0, periodically."""
         self._recording_since = self._camera.host.now
         self._camera.host.send(self.status())
         if 0.0 < status_interval_s < math.inf:

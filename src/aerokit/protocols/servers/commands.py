@@ -175,7 +175,7 @@ class Outcome(NamedTuple):
 
 
 class RunningCommand:
-    """A command that is being executed; COMMAND_CANCEL calls ``cancel``, which returns False if it has no effect."""
+    """A command that is being executed. ``cancel`` returns False if the command cannot be cancelled."""
 
     def __init__(self, command: ReceivedCommand, cancel: Callable[[], bool]) -> None:
         self.command = command
@@ -185,14 +185,13 @@ class RunningCommand:
 
 
 class RunningCommands:
-    """Commands that take time: at most one of each MAV_CMD at a time.
+    """The commands that a component is executing. Sends their IN_PROGRESS messages, and handles COMMAND_CANCEL.
 
-    Sends IN_PROGRESS while they run, and handles COMMAND_CANCEL.
+    While a command runs, a second one with the same MAV_CMD is TEMPORARILY_REJECTED, unless it is a stop command. All
+    new commands are rejected in this way while ``MAX_RUNNING_COMMANDS`` run.
 
     A repeated transmission (COMMAND_LONG with a confirmation) does not execute its command again. The answer is
-    IN_PROGRESS while the command runs, and its result for five seconds after the end. While a command runs, another
-    one with the same MAV_CMD is TEMPORARILY_REJECTED, unless it stops the first one. New commands are also rejected in
-    this way while ``MAX_RUNNING_COMMANDS`` run.
+    IN_PROGRESS while the command runs, and its result for five seconds after the end.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:
@@ -210,10 +209,10 @@ class RunningCommands:
     def start(
         self, command: ReceivedCommand, cancel: Callable[[], bool], *, is_stop: bool = False
     ) -> RunningCommand | None:
-        """Register a command that is to be executed.
+        """Register a command before it is executed.
 
-        If it must not be executed, answer the sender and return None. A stop command (``is_stop``) cancels a running
-        one with the same MAV_CMD.
+        Returns None if the command must not be executed. Its sender has then been answered. A stop command
+        (``is_stop``) first cancels the running command with the same MAV_CMD.
         """
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):
@@ -242,7 +241,8 @@ class RunningCommands:
         if not running.cancel():
             self._running[command.command] = running
             return False
-        if running.command.sender != command.sender:  # The same sender would take it for the answer to `command`.
+        # If both commands have the same sender, it would take CANCELLED for the answer to `command`.
+        if running.command.sender != command.sender:
             self._server.answer(running.command, MavResult.CANCELLED)
         return True
 

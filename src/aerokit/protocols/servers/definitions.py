@@ -63,10 +63,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         return self.values[name], self.definition.settings[name].wire_type
 
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        """Set a value, now or later. Return PARAM_ACK, and the value and type to report.
-
-        A setting in `slow` is set later.
-        """
+        """Set a value, or begin to set it if it is in `slow`. Return PARAM_ACK, and the value and type to report."""
         setting = self.definition.settings.get(name)
         if setting is None:
             return ParamAck.VALUE_UNSUPPORTED, data, kind

@@ -211,7 +211,7 @@ class FileTree:
         return True
 
     def mounted(self, path: str) -> tuple[Mount, str] | None:
-        """Return the mount of a path and the rest of the path. None means that the path is in no mount."""
+        """Return the mount of a path and the rest of the path, or None if the path is in no mount."""
         relative_path = path.removeprefix("/")
         for prefix, mount in self.mounts.items():
             if relative_path.startswith(prefix):

@@ -19,7 +19,7 @@ FilesT = TypeVar("FilesT", bound=FileSystem)
 
 _BURST_BYTES = 35_000  # A burst ends after this number of bytes.
 _BURST_BLOCKS = 24  # number of blocks that a burst sends at once
-_CRC_PAUSE_S = 0.002  # pause between two blocks of a CRC calculation, in which other requests are answered
+_CRC_PAUSE_S = 0.002  # pause in a checksum computation, to answer other requests
 _MAX_SIZE = 0xFFFFFFFF  # maximum file size in bytes, because sizes and offsets have 32 bits in MAVFTP
 
 Op = MavFtpOpcode
@@ -130,7 +130,7 @@ class SessionFtpServer(Generic[FilesT]):
         """Return True if the request repeats the client's latest request, and ``reply`` answers that request."""
         # Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0.
         is_same = peer.request is not None and request.repeats(peer.request)
-        # The last reply of a burst has a higher number. If its request is repeated, the whole burst is sent again.
+        # The last reply of a burst has a higher number, so a repeated burst request starts the burst again.
         reply_sequence = (request.sequence + 1) & 0xFFFF
         return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 
@@ -311,7 +311,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
         """Send a block of a burst, or the NAK that ends the burst.
 
-        ``may_end`` marks the block as the burst's last one if enough data was sent.
+        With ``may_end``, this block is the burst's last one if it has sent enough bytes.
         """
         # Unlike in a request, the sequence number in `burst` is already that of the reply.
         number = session.number
@@ -398,7 +398,7 @@ class SessionFtpServer(Generic[FilesT]):
             return
         with suppress(FileFault):
             file.close()
-        if peer.checksum_request is request:  # A newer request may have replaced this one, which then gets no answer.
+        if peer.checksum_request is request:  # A request that a newer one has replaced gets no answer.
             peer.checksum_request = None
             peer.used_at = self._host.now
             self._reply(peer, self._adapted(peer, request, answer))

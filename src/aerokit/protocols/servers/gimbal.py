@@ -219,7 +219,8 @@ class GimbalRequests:
         if (refusal := self._refusal(command.param1, command)) is not None:
             return refusal
         scale = 1.0 if command.is_long else 1e-7
-        if not (abs(command.x * scale) <= 90.0 and abs(command.y * scale) <= 180.0):  # False for NaN, too.
+        # This comparison also refuses NaN.
+        if not (abs(command.x * scale) <= 90.0 and abs(command.y * scale) <= 180.0):
             return MavResult.DENIED
         # The altitude of a COMMAND_LONG is above mean sea level.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame

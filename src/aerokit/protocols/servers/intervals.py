@@ -82,10 +82,7 @@ class MessageStreams:
             self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send the requested messages, and return the MAV_RESULT.
-
-        It is DENIED for an unknown id, and FAILED if there is nothing to send yet.
-        """
+        """Send the requested messages. Return DENIED for an unknown id, or FAILED if there is nothing to send yet."""
         builder = self.builders.get(message_id)
         if builder is None:
             return MavResult.DENIED
@@ -101,9 +98,9 @@ class MessageStreams:
         message_id = to_int(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
-        # A stream to all channels would also be sent to this channel, in addition to the requested stream.
+        # This channel would otherwise also get the stream to all channels.
         self._streams.pop((None, message_id), None)
-        # There is no default rate, so 0 stops the stream as -1 does.
+        # 0 requests the default rate. There is none, so the stream stops, as with -1.
         is_accepted = self.stream(message_id, to_int(command.param2) / 1e6, command.channel)
         return MavResult.ACCEPTED if is_accepted else MavResult.TEMPORARILY_REJECTED
 

@@ -74,13 +74,13 @@ class ListUpload:
 
 
 class MissionServer:
-    """Stores missions, fences and rally points. Downloads have no state; one upload runs at a time.
+    """Stores missions, fences and rally points. One upload runs at a time; downloads are always answered.
 
     An upload that ``validate`` has accepted replaces the whole list. A missing item is requested again every
     ``retry_interval_s`` seconds. An upload without progress for ``timeout_s`` seconds ends with OPERATION_CANCELLED.
 
-    During an upload, uploads of other clients and all MISSION_CLEAR_ALL are DENIED. While ``validate`` decides on a
-    MISSION_CLEAR_ALL, uploads and other MISSION_CLEAR_ALL are DENIED. Downloads are always answered.
+    During an upload, uploads of other clients and all MISSION_CLEAR_ALL are DENIED. Until ``validate`` has decided on a
+    MISSION_CLEAR_ALL, all uploads and further MISSION_CLEAR_ALL are DENIED.
 
     Subclasses for firmware that behaves differently override methods.
     """

@@ -27,7 +27,10 @@ class NamedList(Protocol):
 
 
 class ParameterLists:
-    """Sends lists in groups of ``burst``, at ``list_rate_hz`` parameters a second. A new request restarts a list."""
+    """Sends all parameters on a channel when a client requests the list.
+
+    ``burst`` parameters are sent at a time, and ``list_rate_hz`` in a second. A new request restarts the list.
+    """
 
     burst: int = 5
     starts_at_once: bool = False
@@ -38,7 +41,7 @@ class ParameterLists:
         self._host = host
         self._listed = parameters
         self._lists: dict[Channel, int] = {}  # channel → number of the list that is being sent on it
-        self._list_number = 0  # number of the latest list; a list ends early if its channel has a newer number
+        self._list_number = 0  # number of the latest list
 
     @property
     def running_lists(self) -> int:
@@ -79,7 +82,7 @@ class ParameterLists:
     def requested(self, name: str, index: int) -> tuple[str, int] | None:
         """Return name and index of the requested parameter, or None if there is no such parameter.
 
-        ``name`` counts only if ``index`` is negative.
+        ``index`` selects the parameter or, if it is negative, ``name``.
         """
         names = self._listed.names
         if index < 0:
@@ -124,7 +127,7 @@ class TypedStore(NamedList, Protocol):
 
     @property
     def small_names(self) -> Sequence[str]:
-        """Names of the parameters whose type `fits_param_value`.
+        """Names of the parameters whose values fit into PARAM_VALUE.
 
         This must be fast, because every PARAM_VALUE needs it.
         """
