@@ -203,9 +203,9 @@ class BackgroundCalls:
             self._loop.call_soon(self._cancel, call)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function on the loop, as soon as all earlier calls have begun.
+        """Call a function on the loop. The function must neither block nor raise.
 
-        On the loop's thread, it is called at once. The function must neither block nor raise.
+        From another thread, the function is called as soon as all earlier calls have begun.
         """
         if self._loop.is_current:
             function(*args)
@@ -304,7 +304,7 @@ class OverrideRelease:
             is_upper = channel > CHANNELS_OF_MAVLINK_1
             if value == (RELEASE_UPPER if is_upper else RELEASE):
                 overridden.discard(channel)
-            elif value not in (IGNORE, RELEASE):  # Above channel 8, 0 leaves the channel unchanged, too.
+            elif value not in (IGNORE, RELEASE):  # RELEASE leaves the channels above 8 unchanged.
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:

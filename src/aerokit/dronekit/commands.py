@@ -152,7 +152,7 @@ class CommandSequence:
             self._download = self._core.order("commands.download", self._run_download, self._download_number)
 
     def wait_ready(self, **kwargs: Any) -> bool:
-        """Wait for the download; arguments, result and errors are those of :meth:`Vehicle.wait_ready`.
+        """Wait for the download, like :meth:`Vehicle.wait_ready` with the same arguments.
 
         Raises APIException with the reason if the download fails. The download can then be repeated.
         """
@@ -189,9 +189,10 @@ class CommandSequence:
 
     @property
     def next(self) -> int:
-        """``seq`` of the current command, which is ``commands[commands.next - 1]``; 0 before the mission starts.
+        """``seq`` of the current command; 0 before the mission starts.
 
-        Set it to select the next command (0: restart the mission). Setting it does not wait.
+        The command is ``commands[commands.next - 1]``, because the list begins with ``seq`` 1. Set ``next`` to change
+        the current command (0: restart the mission). Setting it does not wait.
         """
         return self._current.seq
 

@@ -150,8 +150,8 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             )
         except CommandRejected as error:
             is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
-            # A set-point replaces the unsupported command, unless a newer order or mode change has ended this order, or
-            # the vehicle is silent.
+            # Send a set-point instead of an unsupported command. The order must not have ended because of a newer order
+            # or mode change, and the vehicle must not be silent.
             may_still_order = not order.end and vehicle.heartbeat_age <= MODE_MAX_AGE_S
             if not is_unsupported or not may_still_order:
                 raise

@@ -173,9 +173,9 @@ class VehicleMode(_Named):
 
 
 class SystemStatus(_Named):
-    """The vehicle's MAV_STATE, by its name ``state``. Equals this string, and can be a dict key.
+    """State of the vehicle. Equals the string ``state``, and can be a dict key.
 
-    ``state`` is UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
+    ``state`` is the name of the MAV_STATE: UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
     """
 
     _text, _name_attribute = "SystemStatus:{0.state}", "state"

@@ -61,7 +61,7 @@ def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Load
 
 
 def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message]:
-    """Return the class for one of pymavlink's message classes: the generated one, if the wire formats are the same.
+    """Return the aerokit class for a message class of pymavlink. A class is created if there is none of this format.
 
     Raises:
         InvalidArgument: the fields of pymavlink's class do not match its CRC_EXTRA.

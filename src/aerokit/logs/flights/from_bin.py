@@ -165,7 +165,7 @@ class _Tables:
         return time_us
 
     def _rows_at(self, index: int) -> Iterator[tuple[int, int]]:
-        """Yield the offset and the time in microseconds of row ``index`` of each table that is long enough."""
+        """Yield the offset and the time in microseconds of row ``index`` of each table. Skip tables without this row."""
         reader = self._reader
         for number in reader.name_to_id.values():
             offsets, row_format = reader.offsets[number], reader.formats[number]
@@ -276,7 +276,7 @@ class _Reader:
 
     def _read_mission(self) -> None:
         items: dict[int, Waypoint] = {}
-        total = 0  # the number of items of the newest mission, because earlier ones may have had more
+        total = 0  # number of items of the last mission; `items` may also have items of longer, earlier missions
         for row in self._tables.rows("CMD", "CTot", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
             _, total, number, command, latitude, longitude, altitude, frame = row
             if not has_place(command) or not (latitude or longitude):

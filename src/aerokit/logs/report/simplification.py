@@ -83,7 +83,7 @@ def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> 
     for index in range(first + 1, last):
         point_x, point_y = places[index]
         dx, dy = point_x - x, point_y - y
-        if squared_length:  # replaces (dx, dy) by the distance vector from the segment's nearest point
+        if squared_length:  # measure from the nearest point of the segment instead of its beginning
             fraction = (dx * segment_x + dy * segment_y) / squared_length
             fraction = 0.0 if fraction < 0.0 else min(fraction, 1.0)
             dx, dy = dx - fraction * segment_x, dy - fraction * segment_y
