@@ -53,7 +53,7 @@ class ClassicConnection:
         self.listener_thread: ListenerThread = ListenerThread()
         self.listener_thread.on_called = loop.activity.feed  # Each callback shows that the program does not hang.
         self.loop = loop
-        self._context = context  # the block of `open_connection`, which close() leaves
+        self._context = context  # of `open_connection`; close() exits it
         self.connection: Connection = context.value
         """The asynchronous connection, for code that runs on its loop."""
         self.calls: BackgroundCalls = BackgroundCalls(loop)
@@ -219,9 +219,9 @@ class BackgroundCalls:
             concurrent.futures.wait(pending, timeout)
 
     def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
-        kind = SHARED_KINDS.get(call.kind, call.kind)  # Disarming and arming replace each other.
+        kind = SHARED_KINDS.get(call.kind, call.kind)
         if kind in self._newest:
-            self._cancel(self._newest[kind])  # The new call replaces it.
+            self._cancel(self._newest[kind])  # A new call replaces the previous one of its kind.
         if call.set_running_or_notify_cancel():  # False if the call was cancelled before its start
             name = f"dronekit {call.kind}"
             call.task = asyncio.get_running_loop().create_task(self._run(call, function), name=name)
@@ -254,7 +254,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # Call the function in the next iteration, after the new tasks of earlier calls have sent their messages.
+    # Earlier calls have created tasks. The next iteration of the loop starts these tasks before it calls the function.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

@@ -259,7 +259,7 @@ class CommandSequence:
     def rows(self) -> tuple[Command, ...]:
         """Return the rows of a waypoint file: home and the commands.
 
-        Home is all zeros if it is unknown. Empty if there is neither home nor a command.
+        The row of an unknown home is all zeros. There are no rows if there is neither home nor a command.
         """
         state = self._state
         if state.home is not None:

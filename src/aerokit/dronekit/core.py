@@ -221,7 +221,7 @@ class Core:
         Add the handler before the vehicle is connected. It is called on the loop thread, as long as the `Core` exists.
 
         If the handler only notifies the listeners of attributes, pass the ``names`` of the attributes. When all of them
-        have a value, messages without listeners (on the vehicle or in ``listeners``) do not call the handler. Pass names
+        have a value, the handler is called only if they have listeners (on the vehicle or in ``listeners``). Pass names
         for all handlers of a message type or for none, because the handlers are called together.
         """
         if message_type not in self._latest:

@@ -69,7 +69,7 @@ class Master:
 
     @property
     def port(self) -> Master:
-        """This object itself, because programs call ``port.close()``. It is not a socket or serial port."""
+        """The object itself, so that ``port.close()`` closes the connection. There is no socket or serial port."""
         return self
 
     @property
@@ -245,7 +245,7 @@ class Master:
         self._connection.send(from_pymavlink(message, target), to=target or None)
 
     def _autopilot(self) -> tuple[int, Heartbeat | None]:
-        """Return the component id and the last HEARTBEAT of the vehicle's autopilot; 0 and None before its first."""
+        """Return the component id and the last HEARTBEAT of the vehicle's autopilot; 0 and None before it."""
         for (system_id, component_id), heartbeat in self._connection.connection.heartbeats.copy().items():
             if system_id == self.target_system and is_autopilot(heartbeat):
                 return component_id, heartbeat
@@ -330,7 +330,7 @@ class Inbox(Mapping[str, Any]):
             arrived.finish()
 
     def _pop(self, deadline: float | None) -> Frame | None:
-        """Remove the oldest frame that is not too old. Wait for one until the deadline, then return None."""
+        """Remove and return the oldest stored frame. If there is none until the deadline, return None."""
         now = self._connection.connection.now
         while True:
             with self._lock:

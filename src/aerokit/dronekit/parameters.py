@@ -39,8 +39,8 @@ VERSION_TIMEOUT_S = 1.0
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-# The time-out of each attempt to set a parameter is ROUND_TRIPS round trips of the link, and at least MIN_ATTEMPT_S. The
-# time-out of the last attempt is multiplied by LAST_WAIT_SHARE.
+# The time-out of each attempt to set a parameter is ROUND_TRIPS round trips of the link, and at least MIN_ATTEMPT_S.
+# For the last attempt, it is multiplied by LAST_WAIT_SHARE.
 MIN_ATTEMPT_S, ROUND_TRIPS = 1.0, 3
 LAST_WAIT_SHARE = 0.5
 

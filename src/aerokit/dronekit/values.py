@@ -150,7 +150,7 @@ class Wind(_Value):
 
 
 class _Named(_Value):
-    """Base class of values that compare equal to their name, which is a string, and can be dict keys."""
+    """Base class of values with a name. They are equal to the string of this name, and have the same hash."""
 
     _name_attribute: str
 

@@ -95,7 +95,7 @@ def _load(
 ) -> LoadedDialect:
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
-        # Several files of a dialect may contain the same definition, but not different ones with the same id.
+        # Several files of a dialect may contain the same definition. Different definitions with one id are an error.
         earlier = by_id.setdefault(definition.id, definition)
         if earlier != definition and (earlier.name, earlier.crc_extra) != (definition.name, definition.crc_extra):
             raise InvalidArgument(

@@ -322,7 +322,7 @@ class TimestampFile:
         """Ensure that the stored timestamp is later than ``timestamp``. If not, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
-        # This also delays the next attempt after a failure, because writing may block the event loop.
+        # Set before writing, so that a failed write is not retried with every frame. Writing may block the event loop.
         self.timestamp = min(timestamp + ahead, self._maximum)
         try:
             self._write(self.timestamp)

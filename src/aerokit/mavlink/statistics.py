@@ -58,7 +58,7 @@ class SourceStatistics(SourceFields):
     _other_count: int  # number of frames of the second stream
     _other_at: float
     _skipped_over: int  # number of frames that count as lost between the two streams
-    _returns: int  # number of frames that have continued the previous stream since then
+    _returns: int  # number of further frames of the previous stream
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id
@@ -67,7 +67,7 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # `expected` minus `received`. It does not change with a frame in sequence, for which only `expected` is increased.
+        # `expected` minus `received`. A frame in sequence does not change it, so only `expected` has to be increased.
         self._unreceived = sequence
         # Missing frames: bit 0 is set if the frame before `_missing_base` is missing, bit 1 for the one before that, …
         self._missing = 0
@@ -79,7 +79,7 @@ class SourceStatistics(SourceFields):
         self._alternations = 0  # how often the two streams have alternated
         self._alternated_at = 0.0  # time of the last alternation
         self._last_expected = sequence  # value of `expected` at the last call of `out_of_order`
-        self._advanced_at = 0.0  # time of the last call at which `expected` had advanced
+        self._advanced_at = 0.0  # time of the last call of `out_of_order` with a changed `expected`
 
     @property
     def received(self) -> int:
@@ -171,8 +171,8 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # If the repeated frames are in sequence, a second sender may have sent them. Its frames alternate with the first
-        # sender's.
+        # If the repeated frames are in sequence, a second sender may have sent them. Its frames alternate with the
+        # first sender's.
         if follows:
             self._count_alternation(now)
         else:
@@ -215,7 +215,7 @@ class SourceStatistics(SourceFields):
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # The frame does not count as one of the current stream.
-        # The longer stream is taken for the sender's own, the shorter one for another sender's.
+        # The shorter stream is assumed to come from a second sender.
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:

@@ -216,14 +216,14 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
         was_commanded = change.by_autopilot is False  # `by_autopilot` is None if the log does not contain the cause
         previous_mode = flight.mode_at(change.time_s - 1e-6)
         if is_near and was_armed and not was_commanded and previous_mode:
-            # If the log does not contain the cause, the autopilot is assumed to have made an immediate change. The pilot
-            # may have made a later one.
+            # If the log does not contain the cause, the autopilot is assumed to have made an immediate change. The
+            # pilot may have made a later one.
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
             cause = "" if is_sure else "; cause not logged"
             return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
     until_s = last_s + _DISARMING_TIMEOUT_S
     disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
-    # If the log ends while the vehicle is armed, the last time in `flight.armed` is the end of the log.
+    # If the vehicle was still armed at the end of the log, `flight.armed` ends with the log instead of a disarming.
     if disarmed_s is not None and disarmed_s < flight.duration_s:
         # Disarming counts as the autopilot's reaction only after evidence of a crash.
         is_sure = _kind_of(group) in CRASH_KINDS

@@ -78,9 +78,9 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
-    """Yield each fast descent that ends abruptly, or with the log.
+    """Yield (start, end, highest sink rate near the end, was it stopped) for each fast descent.
 
-    The values are its start and end, its highest sink rate near the end, and False if it ended with the log.
+    A descent is included if it is stopped abruptly, or if the log ends during it.
     """
     begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
     last_fast_s = -math.inf  # the last time at which it sank fast

@@ -50,9 +50,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
         if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     reader_class = import_module("pymavlink.DFReader").DFReader_binary
-    reader = reader_class.__new__(
-        reader_class
-    )  # separate from __init__, so that the reader can be closed if that raises
+    reader = reader_class.__new__(reader_class)  # apart from __init__, so that it can be closed if __init__ raises
     try:
         with redirect_stdout(sys.stderr):  # pymavlink prints about damage, but stdout may be for JSON
             reader.__init__(str(path), progress_callback=on_percent)
