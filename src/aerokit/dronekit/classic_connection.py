@@ -53,7 +53,7 @@ class ClassicConnection:
         self.listener_thread: ListenerThread = ListenerThread()
         self.listener_thread.on_called = loop.activity.feed  # Each callback shows that the program does not hang.
         self.loop = loop
-        self._context = context  # of `open_connection`; close() exits it
+        self._context = context  # the context manager of `open_connection`; close() exits it
         self.connection: Connection = context.value
         """The asynchronous connection, for code that runs on its loop."""
         self.calls: BackgroundCalls = BackgroundCalls(loop)

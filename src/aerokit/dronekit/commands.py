@@ -152,7 +152,7 @@ class CommandSequence:
             self._download = self._core.order("commands.download", self._run_download, self._download_number)
 
     def wait_ready(self, **kwargs: Any) -> bool:
-        """Wait for the download, like :meth:`Vehicle.wait_ready` with the same arguments.
+        """Wait for the download. Arguments and result are those of :meth:`Vehicle.wait_ready`.
 
         Raises APIException with the reason if the download fails. The download can then be repeated.
         """

@@ -216,7 +216,7 @@ class Core:
         *names: str,
         listeners: Listeners | None = None,
     ) -> LatestMessage[MessageT]:
-        """Call a handler with each message of this type from the autopilot. Return the latest-message object.
+        """Call a handler with each message of this type from the autopilot. Return the type's `LatestMessage`.
 
         Add the handler before the vehicle is connected. It is called on the loop thread, as long as the `Core` exists.
 

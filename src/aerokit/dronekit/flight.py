@@ -135,8 +135,8 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # If this order overrules a running one, HEARTBEAT may report the wanted state before either has had an
-                # effect. In this case, `order` must be done, too.
+                # If this order overrules another one, HEARTBEAT may report the wanted state before either order has had
+                # an effect. In this case, `order` must be done, too.
                 return self._dk_reports_armed(value) and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)

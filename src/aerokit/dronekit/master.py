@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
-# Messages are stored from the first access on. For this long after it, a look-up waits for a message that is missing.
+# Messages are stored from the first access on. For this long after it, look-ups wait for missing messages.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
 
@@ -245,7 +245,7 @@ class Master:
         self._connection.send(from_pymavlink(message, target), to=target or None)
 
     def _autopilot(self) -> tuple[int, Heartbeat | None]:
-        """Return the component id and the last HEARTBEAT of the vehicle's autopilot; 0 and None before it."""
+        """Return component id and last HEARTBEAT of the vehicle's autopilot; 0 and None if there was none."""
         for (system_id, component_id), heartbeat in self._connection.connection.heartbeats.copy().items():
             if system_id == self.target_system and is_autopilot(heartbeat):
                 return component_id, heartbeat

@@ -121,7 +121,7 @@ class ParameterDownload:
             return False
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
-        # The code of a rejection comes from the vehicle. Without a code, the vehicle has not answered.
+        # Only a rejection with a code is an answer of the vehicle.
         return all(isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers)
 
 

@@ -114,7 +114,7 @@ RUNPY_FILES = (runpy.__file__, "<frozen runpy>")
 def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> None:
     """Run a DroneKit program in this process, and return when its main program has ended.
 
-    The program finds the environment of ``python program.py arguments…``: ``sys.argv``, its folder first in
+    The program runs in the environment of ``python program.py arguments…``: ``sys.argv``, its folder first in
     ``sys.path``, and ``__name__ == '__main__'``. A folder or zip file with a ``__main__.py`` is a program, too. At the
     end, ``sys`` is restored, and open vehicles are closed. ``import dronekit`` continues to import
     :mod:`aerokit.dronekit`.

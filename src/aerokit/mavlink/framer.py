@@ -27,8 +27,8 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# Python's ``struct`` has no format for three bytes. The message id is therefore the lower three bytes of the last item,
-# whose upper byte belongs to the payload.
+# The last item has four bytes: the message id and the first byte of the payload. ``struct`` has no format for three
+# bytes.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from
@@ -52,7 +52,7 @@ _ValidFrame = tuple[int, int, int, int, int]
 # Findings about the data kept for the next call, which continues with them:
 # - the position up to which the data was examined;
 # - the possible frames: (begin, verdict, size of the data at which to examine the frame again);
-# - the begins of frames with a wrong checksum.
+# - the positions of frames with a wrong checksum.
 _ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
 _NEW_SCAN: _ScanState = (0, [], [])
 

@@ -9,7 +9,7 @@ from aerokit._internal.wire import CounterFields, SourceFields, wire
 _SILENCE_S = 10.0
 
 _MAX_UNKNOWN_IDS = 64
-_HALF = 128  # Sequence numbers wrap at 256: a number is ahead if it is less than 128 further on, otherwise behind.
+_HALF = 128  # Sequence numbers wrap at 256. A number that is this far ahead, or farther, counts as behind.
 _WINDOW = (1 << _HALF) - 1  # mask of the bits in `_missing`
 _MAX_STEP = 4  # Sequence numbers of consecutive frames of one stream rarely differ by more.
 _MAX_GAP = 16  # A frame after a larger gap may belong to another stream.

@@ -58,8 +58,8 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    The vehicle sank 2 m or more, at 3 m/s or more. It stopped within 0.6 s (or 1.5 intervals of the logged velocities),
-    and one of these is true:
+    In each of them, the vehicle sank 2 m or more, at 3 m/s or more. It stopped within 0.6 s (or 1.5 intervals of the
+    logged velocities), and one of these is true:
 
     - It was disarmed within 30 s. Until then, its logged height changed by at most 1.5 m.
     - It was at most 3 m above home. In the next 30 s, its logged height changed by at most 1.5 m.
@@ -131,7 +131,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle stays at about ``height_m`` until it is disarmed. Look at 30 s at most."""
+    """Return True if the vehicle stays at about ``height_m`` until it is disarmed. Only 30 s are examined."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log

@@ -318,7 +318,7 @@ class FlightLog:
             self.armed[-1] = (begin_s, time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Record home, if it is valid. Later than two seconds after the first arming, a known home is not changed.
+        """Record home, if it is valid. A known home is not changed after the first arming (plus two seconds).
 
         Until arming, ArduPilot moves home with the vehicle.
         """

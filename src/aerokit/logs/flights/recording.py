@@ -105,7 +105,7 @@ class LinkCounter:
         return self._second + 1
 
     def add_silence(self, begins_s: float, ends_s: float, paused_s: float) -> None:
-        """Record a silence of the vehicle. During ``paused_s`` seconds of it, no system was recorded."""
+        """Record a silence of the vehicle. In ``paused_s`` seconds of it, nothing at all was recorded."""
         is_recorded = ends_s - begins_s - paused_s >= MIN_SILENCE_S
         self._silences.append(Silence(begins_s, ends_s, is_recorded))
 
