@@ -132,7 +132,7 @@ class VehicleAttributes(VehicleCore):
         super().__init__(handler)
         core = self._dk
         self._location = Locations(self)
-        # Core.on() and Core.announce() return an object that holds the latest message of the type.
+        # Core.on() and Core.announce() return a `LatestMessage`.
         core.on(m.Heartbeat, self._dk_on_heartbeat)
         self._dk_position = core.announce(m.GlobalPositionInt, "velocity")
         self._dk_vfr_hud = core.announce(m.VfrHud, "heading", "airspeed", "groundspeed")

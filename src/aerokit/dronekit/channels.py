@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
 
 MIN_CHANNELS, MAX_CHANNELS = 8, 18
-# MAVLink 2 adds channels to RC_CHANNELS_OVERRIDE, which are released by another value.
+# MAVLink 2 adds channels above this number to RC_CHANNELS_OVERRIDE. Another value releases them.
 MAVLINK_1_CHANNELS = 8
 MAX_MICROSECONDS = 0xFFFF
 UNUSED = 0xFFFF  # The channel does not exist (RC_CHANNELS), or stays unchanged (RC_CHANNELS_OVERRIDE).
@@ -149,7 +149,7 @@ class ChannelsOverride(_ChannelDict):
     it. An invalid channel (KeyError) or value (ValueError) changes and sends nothing.
 
     Each change releases all channels from 1 to 8 that are not in this dict, even if another program overrides them.
-    Other channels above 8 are left as they are.
+    Channels above 8 that this program has not overridden are left as they are.
 
     **Nothing is repeated**: the vehicle ends overrides when it receives none for a while (ArduPilot: RC_OVERRIDE_TIME,
     3 s), which makes a hanging program safe. To hold a stick, set it several times a second. All channels are released

@@ -53,7 +53,7 @@ class ClassicConnection:
         self.listener_thread: ListenerThread = ListenerThread()
         self.listener_thread.on_called = loop.activity.feed  # Each callback shows that the program does not hang.
         self.loop = loop
-        self._context = context  # the block of `open_connection`, which close() leaves
+        self._context = context  # the context manager of `open_connection`; close() exits it
         self.connection: Connection = context.value
         """The asynchronous connection, for code that runs on its loop."""
         self.calls: BackgroundCalls = BackgroundCalls(loop)
@@ -203,9 +203,9 @@ class BackgroundCalls:
             self._loop.call_soon(self._cancel, call)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function on the loop, as soon as all earlier calls have begun.
+        """Call a function on the loop. The function must neither block nor raise.
 
-        On the loop's thread, it is called at once. The function must neither block nor raise.
+        From another thread, the function is called as soon as all earlier calls have begun.
         """
         if self._loop.is_current:
             function(*args)
@@ -219,9 +219,9 @@ class BackgroundCalls:
             concurrent.futures.wait(pending, timeout)
 
     def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
-        kind = SHARED_KINDS.get(call.kind, call.kind)  # Disarming and arming replace each other.
+        kind = SHARED_KINDS.get(call.kind, call.kind)
         if kind in self._newest:
-            self._cancel(self._newest[kind])  # The new call replaces it.
+            self._cancel(self._newest[kind])  # A new call replaces the previous one of its kind.
         if call.set_running_or_notify_cancel():  # False if the call was cancelled before its start
             name = f"dronekit {call.kind}"
             call.task = asyncio.get_running_loop().create_task(self._run(call, function), name=name)
@@ -254,7 +254,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # Call the function in the next iteration, after the new tasks of earlier calls have sent their messages.
+    # Earlier calls have created tasks. The next iteration of the loop starts these tasks before it calls the function.
     asyncio.get_running_loop().call_soon(function, *args)
 
 
@@ -304,7 +304,7 @@ class OverrideRelease:
             is_upper = channel > CHANNELS_OF_MAVLINK_1
             if value == (RELEASE_UPPER if is_upper else RELEASE):
                 overridden.discard(channel)
-            elif value not in (IGNORE, RELEASE):  # Above channel 8, 0 leaves the channel unchanged, too.
+            elif value not in (IGNORE, RELEASE):  # RELEASE leaves the channels above 8 unchanged.
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:

@@ -152,7 +152,7 @@ class CommandSequence:
             self._download = self._core.order("commands.download", self._run_download, self._download_number)
 
     def wait_ready(self, **kwargs: Any) -> bool:
-        """Wait for the download; arguments, result and errors are those of :meth:`Vehicle.wait_ready`.
+        """Wait for the download. Arguments and result are those of :meth:`Vehicle.wait_ready`.
 
         Raises APIException with the reason if the download fails. The download can then be repeated.
         """
@@ -189,9 +189,10 @@ class CommandSequence:
 
     @property
     def next(self) -> int:
-        """``seq`` of the current command, which is ``commands[commands.next - 1]``; 0 before the mission starts.
+        """``seq`` of the current command; 0 before the mission starts.
 
-        Set it to select the next command (0: restart the mission). Setting it does not wait.
+        The command is ``commands[commands.next - 1]``, because the list begins with ``seq`` 1. Set ``next`` to change
+        the current command (0: restart the mission). Setting it does not wait.
         """
         return self._current.seq
 
@@ -258,7 +259,7 @@ class CommandSequence:
     def rows(self) -> tuple[Command, ...]:
         """Return the rows of a waypoint file: home and the commands.
 
-        Home is all zeros if it is unknown. Empty if there is neither home nor a command.
+        The row of an unknown home is all zeros. There are no rows if there is neither home nor a command.
         """
         state = self._state
         if state.home is not None:

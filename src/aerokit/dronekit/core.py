@@ -78,9 +78,9 @@ class Readiness:
         return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
-        """Wait a short time until an attribute gets a value, or reading an attribute fails.
+        """Wait briefly (at most ``max_wait_s``) for an attribute to get a value or to fail.
 
-        Returns at once if no attribute in ``names`` is missing, or if reading a missing one has failed.
+        Returns at once if all attributes in ``names`` have a value, or if reading a missing one has failed.
         """
         with self._lock:
             missing, changed = names - self.names, self._changed
@@ -99,8 +99,8 @@ class LatestMessage(Generic[MessageT]):
         self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
-        # If not empty, the handlers only notify the listeners of these attributes. Without listeners, the message can
-        # then be decoded later.
+        # Attributes whose listeners the handlers notify; empty if the handlers do more than that. A message for which
+        # these attributes have no listeners is decoded later.
         self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
@@ -216,13 +216,13 @@ class Core:
         *names: str,
         listeners: Listeners | None = None,
     ) -> LatestMessage[MessageT]:
-        """Call a handler with each message of this type from the autopilot; return the holder of the latest message.
+        """Call a handler with each message of this type from the autopilot. Return the type's `LatestMessage`.
 
-        The handler is called on the loop thread, as long as this object exists. Add it before the vehicle is connected.
+        Add the handler before the vehicle is connected. It is called on the loop thread, as long as the `Core` exists.
 
-        If the handler only notifies the listeners of attributes, pass the ``names`` of the attributes. After the first
-        value of each, it is then called only while one of them has listeners on the vehicle or in ``listeners``. Pass
-        names for all handlers of a message type or for none, because the handlers are called together.
+        If the handler only notifies the listeners of attributes, pass the ``names`` of the attributes. When all of them
+        have a value, the handler is called only if they have listeners (on the vehicle or in ``listeners``). Pass names
+        for all handlers of a message type or for none, because the handlers are called together.
         """
         if message_type not in self._latest:
             self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)
@@ -231,7 +231,7 @@ class Core:
         return latest
 
     def announce(self, message_type: type[MessageT], *names: str) -> LatestMessage[MessageT]:
-        """Notify the listeners of these attributes when a message arrives; return the holder of the latest message."""
+        """Like :meth:`on`, with a handler that notifies the listeners of the attributes ``names``."""
 
         def announce(_: MessageT) -> None:
             for name in names:

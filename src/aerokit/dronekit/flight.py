@@ -135,8 +135,8 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # After an opposite order, HEARTBEAT may still report the state from before both orders, so `order` must
-                # be done, too.
+                # If this order overrules another one, HEARTBEAT may report the wanted state before either order has had
+                # an effect. In this case, `order` must be done, too.
                 return self._dk_reports_armed(value) and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
@@ -334,7 +334,7 @@ class FlightMethods(VehicleAttributes):
         self.wait_for(has_reached, timeout, errmsg="failed to reach specified altitude")
 
     def _dk_altitude_condition(self, alt: float, epsilon: float, *, is_relative: bool) -> Callable[[], bool]:
-        """Return a function: True if the altitude is near ``alt``, or has passed ``alt`` since the first call."""
+        """Return a condition that is true if the altitude is near ``alt``, or has passed it since the first call."""
         start: float | None = None
 
         def has_reached() -> bool:

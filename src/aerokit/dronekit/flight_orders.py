@@ -150,8 +150,8 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             )
         except CommandRejected as error:
             is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
-            # A set-point replaces the unsupported command, unless a newer order or mode change has ended this order, or
-            # the vehicle is silent.
+            # Send a set-point instead of an unsupported command. The order must not have ended because of a newer order
+            # or mode change, and the vehicle must not be silent.
             may_still_order = not order.end and vehicle.heartbeat_age <= MODE_MAX_AGE_S
             if not is_unsupported or not may_still_order:
                 raise
@@ -200,7 +200,7 @@ def check_speed(name: str, speed: float | None) -> None:
 
 
 class CurrentCommand:
-    """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
+    """Reads and sets the current command of a mission (MISSION_CURRENT, MISSION_SET_CURRENT).
 
     The numbers are ArduPilot's for all autopilots: home is 0, the first item is 1. ArduPilot reports 0 before it flies
     a mission. PX4 counts the first item as 0, so its numbers are converted; they become 0 while no mission is active.
@@ -256,7 +256,7 @@ class CurrentCommand:
         # MISSION_SET_CURRENT was not confirmed in time, so send a command instead, which the vehicle acknowledges.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:  # `mission.set_current` cannot select home, because its 0 is the first item after home.
+        if seq == 0:  # `mission.set_current` cannot select home. Its index 0 is the first item after home.
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)
@@ -275,7 +275,7 @@ class Maintenance(VehicleCore):
 
     # -------------------------------------------------------------------------- calibrations
 
-    # The parameters of PREFLIGHT_CALIBRATION stand for gyroscopes, compasses, pressure, radio and accelerometers.
+    # PREFLIGHT_CALIBRATION has one parameter each for gyroscopes, compasses, pressure, radio and accelerometers.
 
     def send_calibrate_gyro(self) -> None:
         """Calibrate the gyroscopes: keep the vehicle still."""

@@ -50,7 +50,7 @@ class Gimbal(GimbalPrivates):
     def yaw(self) -> float | None:
         """Yaw in degrees clockwise from north, 0 to 360. May be None while the vehicle's heading is unknown.
 
-        ArduPilot before 4.3 reports the angle in MOUNT_STATUS, whose reference depends on the firmware.
+        With ArduPilot before 4.3, the angle is that of MOUNT_STATUS. Its reference depends on the firmware.
         """
         return self._attitude.yaw_deg
 

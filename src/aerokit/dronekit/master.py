@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
-# Messages are stored from the first access on. For this long, a look-up then waits until its message arrives.
+# Messages are stored from the first access on. For this long after it, look-ups wait for missing messages.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
 
@@ -69,7 +69,7 @@ class Master:
 
     @property
     def port(self) -> Master:
-        """This object itself, because programs call ``port.close()``. It is not a socket or serial port."""
+        """The object itself, so that ``port.close()`` closes the connection. There is no socket or serial port."""
         return self
 
     @property
@@ -245,7 +245,7 @@ class Master:
         self._connection.send(from_pymavlink(message, target), to=target or None)
 
     def _autopilot(self) -> tuple[int, Heartbeat | None]:
-        """Return the component id and the last HEARTBEAT of the vehicle's autopilot; 0 and None before its first."""
+        """Return component id and last HEARTBEAT of the vehicle's autopilot; 0 and None if there was none."""
         for (system_id, component_id), heartbeat in self._connection.connection.heartbeats.copy().items():
             if system_id == self.target_system and is_autopilot(heartbeat):
                 return component_id, heartbeat
@@ -330,7 +330,7 @@ class Inbox(Mapping[str, Any]):
             arrived.finish()
 
     def _pop(self, deadline: float | None) -> Frame | None:
-        """Remove the oldest frame that is not too old. Wait for one until the deadline, then return None."""
+        """Remove and return the oldest stored frame. If there is none until the deadline, return None."""
         now = self._connection.connection.now
         while True:
             with self._lock:

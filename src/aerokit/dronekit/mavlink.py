@@ -116,7 +116,7 @@ class MAVConnection(ClassicConnection):
     # ---------------------------------------------------------------------------- life cycle
 
     def start(self) -> None:
-        """Raise if the connection has ended. Otherwise do nothing, because a new connection already receives."""
+        """Do nothing, because the connection already receives. If the connection has ended, raise an error."""
         self.connection.raise_if_ended()
 
     def reset(self) -> None:

@@ -100,7 +100,7 @@ class Listeners:
             self._thread.post_or_drop(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """Call the listeners with the value of the owner's attribute. Without listeners, it is not read."""
+        """Call the listeners with the value of the owner's attribute, which is not read without listeners."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:

@@ -39,8 +39,8 @@ VERSION_TIMEOUT_S = 1.0
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-# An attempt to set a parameter may take ROUND_TRIPS round trips of the link, but at least MIN_ATTEMPT_S. For the last
-# attempt, this time is multiplied by LAST_WAIT_SHARE.
+# The time-out of each attempt to set a parameter is ROUND_TRIPS round trips of the link, and at least MIN_ATTEMPT_S.
+# For the last attempt, it is multiplied by LAST_WAIT_SHARE.
 MIN_ATTEMPT_S, ROUND_TRIPS = 1.0, 3
 LAST_WAIT_SHARE = 0.5
 
@@ -121,7 +121,7 @@ class ParameterDownload:
             return False
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
-        # A rejection with a code is the answer that the parameter is missing. A rejection without a code is no answer.
+        # Only a rejection with a code is an answer of the vehicle.
         return all(isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers)
 
 
@@ -353,7 +353,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return attr_name.upper()
 
     def _find(self, name: object, *, waits: bool = True) -> ResolvedParameter | None:
-        """Look up a parameter by name. With ``waits``, request a missing one, unless all were received."""
+        """Return a parameter, or None if it is unknown. With ``waits``, a parameter not yet received is requested."""
         if not isinstance(name, str):
             return None
         name = name.upper()

@@ -17,8 +17,8 @@ HEARTBEAT_TIMEOUT_S = 5.0  # DroneKit reports a link time-out after this many se
 class OverridableProperty(Generic[T]):
     """A property that an instance attribute of the same name overrides.
 
-    Used for private names of DroneKit 2.9, and for names that it does not have: a program's subclass of Vehicle may
-    assign its own attributes to them.
+    Used for the private names of DroneKit 2.9, and for names that DroneKit does not have. Programs may assign their own
+    attributes to these names in a subclass of Vehicle.
     """
 
     def __init__(self, getter: Callable[[Any], T]) -> None:
@@ -34,7 +34,7 @@ class OverridableProperty(Generic[T]):
 
 
 def attribute_path(path: str) -> OverridableProperty[Any]:
-    """Return a property that reads a path such as ``gimbal.pitch``; None if any part of it is None."""
+    """Return a property that reads a path such as ``gimbal.pitch``. Its value is None if any part is None."""
     names = path.split(".")
 
     def read(instance: Any) -> Any:

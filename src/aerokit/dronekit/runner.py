@@ -114,7 +114,7 @@ RUNPY_FILES = (runpy.__file__, "<frozen runpy>")
 def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> None:
     """Run a DroneKit program in this process, and return when its main program has ended.
 
-    The program finds the environment of ``python program.py arguments…``: ``sys.argv``, its folder first in
+    The program runs in the environment of ``python program.py arguments…``: ``sys.argv``, its folder first in
     ``sys.path``, and ``__name__ == '__main__'``. A folder or zip file with a ``__main__.py`` is a program, too. At the
     end, ``sys`` is restored, and open vehicles are closed. ``import dronekit`` continues to import
     :mod:`aerokit.dronekit`.
@@ -280,7 +280,7 @@ def _run_file(path: str, arguments: Sequence[str]) -> None:
     if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
         runpy.run_path(path, run_name="__main__")
         return
-    # A file is not run by runpy, which removes the module `__main__` at the end, although threads may still need it.
+    # For a file, runpy would remove the module `__main__` at the end, but threads may still need the module.
     path = os.path.abspath(path)
     with io.open_code(path) as file:
         source = file.read()
@@ -317,7 +317,7 @@ def _print_program_traceback(kind: type[BaseException], error: BaseException, tr
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
     entry = traceback
-    # Skip our frames up to the one that runs the program, then those of runpy.
+    # The first frames are our own, up to the function that runs the program. Frames of runpy may follow.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
         entry = entry.tb_next
     if entry is None:  # The error did not happen in the program, so all frames are of interest.

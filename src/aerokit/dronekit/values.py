@@ -150,7 +150,7 @@ class Wind(_Value):
 
 
 class _Named(_Value):
-    """Base class of values that compare equal to their name, which is a string, and can be dict keys."""
+    """Base class of values with a name. They are equal to the string of this name, and have the same hash."""
 
     _name_attribute: str
 
@@ -173,9 +173,9 @@ class VehicleMode(_Named):
 
 
 class SystemStatus(_Named):
-    """The vehicle's MAV_STATE, by its name ``state``. Equals this string, and can be a dict key.
+    """State of the vehicle. Equals the string ``state``, and can be a dict key.
 
-    ``state`` is UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
+    ``state`` is the name of the MAV_STATE: UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
     """
 
     _text, _name_attribute = "SystemStatus:{0.state}", "state"

@@ -186,7 +186,7 @@ class _Extended(Dialect):
 
 
 def _merge_enums(first: type[Any], second: type[Any]) -> type[Any]:
-    # A private dialect may add entries to an enum of the standard. If both define an entry, the first one is used.
+    # A private dialect may add entries to an enum of the standard. Entries of `first` take precedence.
     members = {**second.__members__, **first.__members__}
     bitmask = issubclass(first, IntFlag)
     return make_enum(first.__module__, first.__name__, bitmask, first.__doc__ or "", members.items())

@@ -27,8 +27,8 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# Python's ``struct`` has no format for three bytes. The message id is therefore the lower three bytes of the last item,
-# whose upper byte belongs to the payload.
+# The last item has four bytes: the message id and the first byte of the payload. ``struct`` has no format for three
+# bytes.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from
@@ -49,10 +49,10 @@ _NOISE = 5
 # Position of a valid frame, and parts of its header: (begin, end, message id, sequence number, source).
 _ValidFrame = tuple[int, int, int, int, int]
 
-# What is known about the kept data, so that it is not examined again with each further byte:
-# - the position up to which it was examined;
-# - the candidates for frames: (begin, verdict, size of the data at which to examine the candidate again);
-# - the positions of bad checksums.
+# Findings about the data kept for the next call, which continues with them:
+# - the position up to which the data was examined;
+# - the possible frames: (begin, verdict, size of the data at which to examine the frame again);
+# - the positions of frames with a wrong checksum.
 _ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
 _NEW_SCAN: _ScanState = (0, [], [])
 
@@ -206,10 +206,9 @@ class PythonFramer:
         return len(self._rest)
 
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
-        """Sort the frames that were out of order into :attr:`late` and :attr:`foreign`.
+        """Add the frames that were out of order to :attr:`late` or :attr:`foreign`.
 
-        An entry of ``out_of_order`` has the position of a frame in ``frames``, the result of
-        `SourceStatistics.out_of_order`, and the frame's sequence number and sender.
+        ``out_of_order`` has (position in ``frames``, `LATE` or `OTHERS`, sequence number and sender) for each of them.
         """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
@@ -228,7 +227,7 @@ class PythonFramer:
         """Return the next valid frame from ``begin`` on, or None. Keep data that may become a frame in ``_rest``."""
         size = len(data)
         keep_from = -1  # position from which data is kept
-        unknown_begin = unknown_end = -1  # position of what may be a frame of an unknown message; -1 if there is none
+        unknown_begin = unknown_end = -1  # a possible frame of an unknown message; -1 if there is none
         examined_to, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
@@ -301,9 +300,9 @@ class PythonFramer:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
-        """Examine a possible frame at ``begin``.
+        """Examine a possible frame at ``begin``. Return the verdict, the position of its end, and the valid frame.
 
-        Return the verdict, the end of the frame (of its header, if that is incomplete), and the frame if it is valid.
+        If the header is incomplete, the second value is the end of the header.
         """
         size = len(data)
         if data[begin] == MAGIC_V2:

@@ -74,7 +74,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the first of both origins in `STANDARD_FILES`, and the remarks of ``added``, if any."""
+    """Return ``existing`` with the origin that is first in `STANDARD_FILES`. Remarks of ``added`` take precedence."""
     origin = min(
         existing.origin,
         added.origin,

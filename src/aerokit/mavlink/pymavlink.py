@@ -97,8 +97,7 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
 
 
 def _has(message: Any, name: str) -> bool:
-    # hasattr() is not enough for pymavlink's messages. All their classes have an attribute ``id`` (the message id), but
-    # ``id`` may also be the name of an extension field.
+    # All classes of pymavlink have an attribute ``id``, the message id. It must not be mistaken for a field ``id``.
     if name in getattr(message, "__dict__", ()):
         return True
     return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")

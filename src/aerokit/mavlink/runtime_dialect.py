@@ -61,7 +61,7 @@ def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Load
 
 
 def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message]:
-    """Return the class for one of pymavlink's message classes: the generated one, if the wire formats are the same.
+    """Return the aerokit class for a message class of pymavlink. A class is created if there is none of this format.
 
     Raises:
         InvalidArgument: the fields of pymavlink's class do not match its CRC_EXTRA.
@@ -95,7 +95,7 @@ def _load(
 ) -> LoadedDialect:
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
-        # Several files of a dialect may contain the same definition, but not different ones with the same id.
+        # Several files of a dialect may contain the same definition. Different definitions with one id are an error.
         earlier = by_id.setdefault(definition.id, definition)
         if earlier != definition and (earlier.name, earlier.crc_extra) != (definition.name, definition.crc_extra):
             raise InvalidArgument(

@@ -180,7 +180,7 @@ class Signing:
         if keep is not None:
             self._timestamp_file = TimestampFile(keep, LAST_TIMESTAMP)
             self.timestamp = max(self.timestamp, self._timestamp_file.timestamp)
-        # A signature is a hash that begins with the key. The key is hashed once; each signature copies this state.
+        # The key is the first input of each signature's hash. It is hashed once, and the hash object is then copied.
         self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
         """Last timestamp of each (system id, component id, link id). :meth:`for_link` shares it among links."""
@@ -281,8 +281,7 @@ class Signing:
         # Store the timestamp before using it, so that the next program starts with a later timestamp even after a
         # crash.
         if self._timestamp_file is not None:
-            # A restarted program may sign with timestamps half a minute ahead of other senders. Receivers accept a
-            # difference of one minute.
+            # A restarted program may be up to half a minute ahead of other senders. Receivers accept one minute.
             self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)
         self.timestamp = timestamp
 
@@ -323,7 +322,7 @@ class TimestampFile:
         """Ensure that the stored timestamp is later than ``timestamp``. If not, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
-        # This also delays the next attempt after a failure, because writing may block the event loop.
+        # Set before writing, so that a failed write is not retried with every frame. Writing may block the event loop.
         self.timestamp = min(timestamp + ahead, self._maximum)
         try:
             self._write(self.timestamp)

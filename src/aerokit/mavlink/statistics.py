@@ -9,14 +9,14 @@ from aerokit._internal.wire import CounterFields, SourceFields, wire
 _SILENCE_S = 10.0
 
 _MAX_UNKNOWN_IDS = 64
-_HALF = 128  # Sequence numbers wrap at 256: a number is ahead if it is less than 128 further on, otherwise behind.
+_HALF = 128  # Sequence numbers wrap at 256. A number that is this far ahead, or farther, counts as behind.
 _WINDOW = (1 << _HALF) - 1  # mask of the bits in `_missing`
 _MAX_STEP = 4  # Sequence numbers of consecutive frames of one stream rarely differ by more.
 _MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
 _MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
 _EXPIRY_S = 5.0  # A second stream and its alternations are forgotten after this time.
 _STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
-_MIN_RETURNS = 3  # This many frames that continue the previous stream show that it has not ended.
+_MIN_RETURNS = 3  # A longer previous stream replaces the current one after this many further frames.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHERS = range(3)
@@ -26,7 +26,7 @@ class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
     Two senders with the same ids are detected, because their sequence numbers form two streams. Losses are then counted
-    only in the stream with more frames. After it has been silent for 1.5 s, they are counted in the other one.
+    only in the stream with more frames. When this stream has been silent for 1.5 s, the other one replaces it.
     """
 
     expected: int
@@ -58,7 +58,7 @@ class SourceStatistics(SourceFields):
     _other_count: int  # number of frames of the second stream
     _other_at: float
     _skipped_over: int  # number of frames that count as lost between the two streams
-    _returns: int  # number of frames that have continued the previous stream since then
+    _returns: int  # number of further frames of the previous stream
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id
@@ -67,8 +67,7 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # `expected` minus `received`. This is stored instead of `received`, so that a frame in sequence increases only
-        # `expected`.
+        # `expected` minus `received`. A frame in sequence does not change it, so only `expected` has to be increased.
         self._unreceived = sequence
         # Missing frames: bit 0 is set if the frame before `_missing_base` is missing, bit 1 for the one before that, …
         self._missing = 0
@@ -80,7 +79,7 @@ class SourceStatistics(SourceFields):
         self._alternations = 0  # how often the two streams have alternated
         self._alternated_at = 0.0  # time of the last alternation
         self._last_expected = sequence  # value of `expected` at the last call of `out_of_order`
-        self._advanced_at = 0.0  # time of the last call at which `expected` had advanced
+        self._advanced_at = 0.0  # time of the last call of `out_of_order` with a changed `expected`
 
     @property
     def received(self) -> int:
@@ -151,7 +150,7 @@ class SourceStatistics(SourceFields):
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _consume_missing(self, behind: int) -> bool:
-        """Mark the frame `expected` - ``behind`` as no longer missing. Return True if it was missing."""
+        """Mark the frame ``behind`` places before `expected` as received. Return True if it was missing."""
         self._missing, self._missing_base = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
@@ -172,8 +171,8 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # A frame that follows the last repeated frame may be a second sender's, whose frames alternate with these. Any
-        # other repeated frame resets the count.
+        # If the repeated frames are in sequence, a second sender may have sent them. Its frames alternate with the
+        # first sender's.
         if follows:
             self._count_alternation(now)
         else:
@@ -193,7 +192,7 @@ class SourceStatistics(SourceFields):
         self._missing = self._skipped_over = 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        """Process a frame that continues the other of two streams. Return a result of :meth:`out_of_order`."""
+        """Process a frame of the stream that is not the current one. Return a result of :meth:`out_of_order`."""
         current_count = self.received - self._stream_start
         is_other_longer = self._other_count > current_count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
@@ -216,12 +215,12 @@ class SourceStatistics(SourceFields):
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # The frame does not count as one of the current stream.
-        # The longer stream is taken for the sender's own, the shorter one for another sender's.
+        # The shorter stream is assumed to come from a second sender.
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
-        # The gap between the streams was not a loss. max() is needed, because frames of the gap that arrived late are
-        # already subtracted.
+        # The sequence numbers between the two streams are not lost frames. max() is needed, because late frames among
+        # them are already subtracted.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
         self._other_count = current_count

@@ -19,8 +19,8 @@ _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
-# While searching for a record after garbage, ignore times before the year 2000: zeros in a frame's header look like
-# such a time. Directly after a record, accept them, because the computer's clock may have been wrong.
+# While searching for a record after garbage, ignore times before the year 2000, because zeros in a frame's header look
+# like such times. A record directly after another one may have any time, because the computer's clock may be wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
 # If the first two bytes of a time are not larger than these, the time is before _LAST_TIME.
@@ -62,8 +62,8 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
             if records:
                 yield from records
                 continue
-        # For an unsigned MAVLink 2 frame before another one, this takes half the time of `_record_end`. The record has
-        # 20 bytes in addition to the payload: 8 for the time and 12 for the frame.
+        # Fast path for two consecutive records with unsigned MAVLink 2 frames. A record has 20 bytes in addition to the
+        # payload: 8 for the time and 12 for the frame.
         try:
             end = begin + 20 + data[begin + 9]
             if (

@@ -221,7 +221,7 @@ class MessageTablesWriter:
             name = f"{len(self._tables)}_{name}"
         table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
         self._tables.append(table)
-        # The numbers of MAVLink messages are Python's own; those of a flight controller's log may be NumPy's.
+        # add_numbers() needs Python's numbers. Rows without a message, of a flight controller's log, may have NumPy's.
         has_only_numbers = record.message is not None and all(column.kind != "str" for column in columns)
         add_row = table.add_numbers if has_only_numbers else table.add
         self._converters[record.table] = add_row, _row_maker(columns, record)

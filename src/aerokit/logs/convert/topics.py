@@ -268,8 +268,8 @@ def _rotation(attitude: Attitude | None) -> dict[str, float]:
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     if attitude is not None and all(map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))):
         w, x, y, z = attitude.quaternion
-    # MAVLink's quaternion relates the axes forward, right, down to the axes north, east, down. Both changes of axes
-    # are rotations by 180°, so each component of the result is a sum or difference of two of MAVLink's components.
+    # MAVLink's quaternion is that of a body frame (forward, right, down) in the frame (north, east, down). Both frames
+    # are changed by a rotation of 180°, which results in these sums and differences.
     half = math.sqrt(0.5)
     return {"x": half * (x + y), "y": half * (x - y), "z": half * (w - z), "w": half * (w + z)}
 
@@ -289,7 +289,7 @@ def _schema_of(value: object) -> dict[str, Any]:
     if isinstance(converted, dict):
         return {"type": "object", "properties": {name: _schema_of(item) for name, item in converted.items()}}
     if isinstance(converted, list):
-        items = value if isinstance(value, (list, tuple)) else converted  # `converted` has lost the annotations
+        items = value if isinstance(value, (list, tuple)) else converted  # `converted` has no annotations
         return {"type": "array", "items": _schema_of(items[0]) if items else {}}
     return {} if converted is None else {"type": _JSON_TYPES[type(converted).__name__]}
 

@@ -144,9 +144,8 @@ def _complete_altitudes(flight: FlightLog) -> None:
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
-            # While ArduPilot does not know one of the two altitudes, it logs the other one for both.
-            # Unless home is near sea level, the two altitudes must differ. If they do not, the log has the same
-            # altitude in both columns.
+            # While ArduPilot knows only one altitude, it logs this value in both columns. Equal values show this,
+            # unless home is near sea level.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
                 # If the value is nearer to home's altitude than to 0, it is an altitude above sea level. Otherwise, it
                 # is a height above home.

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
-# Replaces _GENERAL_GAP_S if the reaction is delayed. Without satellites, autopilots continue with dead reckoning for
-# some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
+# This longer time applies if the autopilot delays its reaction. Without satellites, autopilots continue with dead
+# reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
 # A reaction is a mode change or disarming within these times after the last evidence.
 _REACTION_TIMEOUT_S, _DISARMING_TIMEOUT_S = 12.0, 3.0
@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe or, if ``acted`` is False, a warning: a problem without a certain reaction of the autopilot."""
+    """A failsafe. If ``acted`` is False, it is only a warning: the autopilot did not certainly react."""
 
     time_s: float
     kind: str
@@ -144,9 +144,9 @@ def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
 
 
 def failsafes(flight: FlightLog) -> list[Failsafe]:
-    """Return the failsafes and problems of the time in which the vehicle was armed, the oldest first.
+    """Return the failsafes and warnings of the armed vehicle, the oldest first.
 
-    Evidence also counts if it is from shortly before arming or shortly after disarming.
+    Those from shortly before arming or shortly after disarming are included.
     """
     groups: list[list[FailsafeEvidence]] = []
     recent_groups: list[list[FailsafeEvidence]] = []
@@ -204,7 +204,7 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
-    """Return a description of the reaction, and True if it is the autopilot's.
+    """Return a description of the reaction, and True if it certainly came from the autopilot.
 
     The description is empty if there was no reaction. ``time_s`` is the time of the first evidence in ``group``.
     """
@@ -216,14 +216,14 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
         was_commanded = change.by_autopilot is False  # `by_autopilot` is None if the log does not contain the cause
         previous_mode = flight.mode_at(change.time_s - 1e-6)
         if is_near and was_armed and not was_commanded and previous_mode:
-            # If the cause is not in the log, an immediate change counts as the autopilot's. A later change may be the
-            # pilot's.
+            # If the log does not contain the cause, the autopilot is assumed to have made an immediate change. The
+            # pilot may have made a later one.
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
             cause = "" if is_sure else "; cause not logged"
             return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
     until_s = last_s + _DISARMING_TIMEOUT_S
     disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
-    # If the log ends while the vehicle is armed, the last time in `flight.armed` is the end of the log.
+    # If the vehicle was still armed at the end of the log, `flight.armed` ends with the log instead of a disarming.
     if disarmed_s is not None and disarmed_s < flight.duration_s:
         # Disarming counts as the autopilot's reaction only after evidence of a crash.
         is_sure = _kind_of(group) in CRASH_KINDS

@@ -58,15 +58,15 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    A descent is a candidate if the vehicle sank 2 m or more, at 3 m/s or more. It counts if it stopped within 0.6 s (or
-    1.5 intervals of the logged velocities), and one of these is true:
+    In each of them, the vehicle sank 2 m or more, at 3 m/s or more. It stopped within 0.6 s (or 1.5 intervals of the
+    logged velocities), and one of these is true:
 
-    - The vehicle was disarmed within 30 s. No logged height shows that it climbed or sank again before.
-    - It stopped at most 3 m above home. No logged height of the next 30 s shows that it climbed or sank again.
+    - It was disarmed within 30 s. Until then, its logged height changed by at most 1.5 m.
+    - It was at most 3 m above home. In the next 30 s, its logged height changed by at most 1.5 m.
     - The log has evidence of a fall: see `Fall.reasons`.
 
-    If the log ends during the descent, it counts if there is such evidence, or if the vehicle would have reached home's
-    height within 2 s.
+    If the log ends during a descent, the descent is a fall or hard landing if there is such evidence, or if the vehicle
+    would have reached home's height within 2 s.
     """
     if not flight.armed:
         return []
@@ -78,9 +78,9 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
-    """Yield each fast descent that ends abruptly, or with the log.
+    """Yield (start, end, highest sink rate near the end, was it stopped) for each fast descent.
 
-    The values are its start and end, its highest sink rate near the end, and False if it ended with the log.
+    A descent is included if it is stopped abruptly, or if the log ends during it.
     """
     begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
     last_fast_s = -math.inf  # the last time at which it sank fast
@@ -114,8 +114,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
     if not lost_height_m >= _MIN_HEIGHT_M:  # `not >=` is also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    # Without an impact, the log ends during the descent. The vehicle then counts as on the ground if it would reach the
-    # ground within two seconds.
+    # If the log ends during the descent, the vehicle must be at most two seconds above the ground.
     near_ground_m = 2 * sink_m_s
     is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < near_ground_m
     if not (is_on_ground or reasons):  # Logged reasons suffice at any height.
@@ -132,12 +131,12 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle stays at about ``height_m`` until disarming (at most 30 s), and does not hover."""
+    """Return True if the vehicle stays at about ``height_m`` until it is disarmed. Only 30 s are examined."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log
     if not was_disarmed and height_m > _NEAR_HOME_HEIGHT_M:
-        return False  # the vehicle may be hovering
+        return False  # The vehicle may be hovering.
     heights = flight.track.between("altitude_relative_m", time_s + _IMPACT_S, until_s)
     return all(abs(height - height_m) <= _SAME_HEIGHT_M for height in heights)
 

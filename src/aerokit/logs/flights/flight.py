@@ -318,10 +318,9 @@ class FlightLog:
             self.armed[-1] = (begin_s, time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Record home, if it is valid.
+        """Record home, if it is valid. A known home is not changed after the first arming (plus two seconds).
 
-        Until arming, ArduPilot moves home with the vehicle. A known home is therefore kept from two seconds after the
-        first arming on.
+        Until arming, ArduPilot moves home with the vehicle.
         """
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
         if not is_valid:  # NaN is not valid, because it fails the comparisons

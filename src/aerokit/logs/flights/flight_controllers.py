@@ -50,7 +50,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
         if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     reader_class = import_module("pymavlink.DFReader").DFReader_binary
-    reader = reader_class.__new__(reader_class)  # __init__ is called below; if it raises, `reader` can be closed
+    reader = reader_class.__new__(reader_class)  # apart from __init__, so that it can be closed if __init__ raises
     try:
         with redirect_stdout(sys.stderr):  # pymavlink prints about damage, but stdout may be for JSON
             reader.__init__(str(path), progress_callback=on_percent)
@@ -128,7 +128,7 @@ def _optional_state(name: str, value: object) -> States:
 
 
 class BinReader(_RowReader):
-    """Reads a ``.bin`` of ArduPilot with pymavlink. The system id is in its parameters; if it is missing, it is 1."""
+    """Reads a ``.bin`` of ArduPilot with pymavlink. The system id is that of the logged parameters, or else 1."""
 
     _reader: Any = None
 

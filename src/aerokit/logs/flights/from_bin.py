@@ -49,7 +49,7 @@ _HOME = 1
 _NULL_ISLAND_DEG = 0.01
 # A row is damaged in two cases:
 # - It is later than the next row of its table, or earlier than the previous one, by more than _MAX_DISORDER_S.
-# - It is later than the last but one row of every table by more than _MAX_LATE_S.
+# - It is later than the second to last row of all tables by more than _MAX_LATE_S.
 _MAX_DISORDER_S, _MAX_LATE_S = 1.0, 3600.0
 _SAME_SETPOINT_S = 0.005  # PSCN and PSCE rows with times that differ by at most this are one set-point
 _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the rows
@@ -123,7 +123,7 @@ class _Tables:
         row_format = reader.formats[reader.name_to_id[table]]
         indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
         unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
-        # An unpacked row has the order of the file. `positions` has the index of each requested column in it.
+        # The columns of unpacked rows are in the order of the file. `positions` has the index of each requested column.
         positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]
@@ -165,7 +165,7 @@ class _Tables:
         return time_us
 
     def _rows_at(self, index: int) -> Iterator[tuple[int, int]]:
-        """Yield the offset and the time in microseconds of row ``index`` of each table that is long enough."""
+        """Yield the offset and the time (µs) of row ``index`` of each table. Tables without this row are skipped."""
         reader = self._reader
         for number in reader.name_to_id.values():
             offsets, row_format = reader.offsets[number], reader.formats[number]
@@ -276,7 +276,7 @@ class _Reader:
 
     def _read_mission(self) -> None:
         items: dict[int, Waypoint] = {}
-        total = 0  # the number of items of the newest mission, because earlier ones may have had more
+        total = 0  # number of items of the last mission; `items` may also have items of longer, earlier missions
         for row in self._tables.rows("CMD", "CTot", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
             _, total, number, command, latitude, longitude, altitude, frame = row
             if not has_place(command) or not (latitude or longitude):
@@ -393,8 +393,8 @@ class _Reader:
             for time_s, *ratios in self._tables.rows(table, *columns):
                 self._flight.estimator.add(time_s, *ratios)
             return
-        # Each row belongs to one of several estimators (C), and PI is the number of the primary estimator. Only rows of
-        # the primary estimator are used. A negative PI stands for 0.
+        # Only rows of the primary estimator are used. C is the estimator of the row, PI the primary one. A negative PI
+        # means 0.
         for time_s, *ratios, core, primary in self._tables.rows(table, *columns, "C", "PI"):
             if core == max(primary, 0):
                 self._flight.estimator.add(time_s, *ratios)

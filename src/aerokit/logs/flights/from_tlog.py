@@ -40,8 +40,8 @@ _HEARTBEAT_ID = b"\0\0\0"
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 # If a record is earlier than the previous one by more than this, the recording's clock was set back.
 _MAX_DISORDER_S = 1.0
-# If the time of a record differs from the previous one by more than this, the record is damaged, unless the next record
-# has a similar time.
+# A record is skipped as damaged if its time differs from the previous record's by more than this. If the next record
+# has a similar time, the time is right.
 _DOUBTFUL_JUMP_S = 3600.0
 # If no HEARTBEAT arrives for longer than this, the arming state is unknown.
 _MAX_HEARTBEAT_INTERVAL_S = 5.0
@@ -99,7 +99,7 @@ class _Reader:
         self._mode_commands = RecordedModeCommands(flight, self._autopilot)
         self._system_status = 0
         self._last_heartbeat_s, self._was_armed = 0.0, False
-        self._armed_gaps: list[tuple[float, float]] = []  # spans without HEARTBEAT, of an armed vehicle
+        self._armed_gaps: list[tuple[float, float]] = []  # times without HEARTBEAT while armed
         self._has_battery_status = False
         self._charge_states: dict[int, int] = {}  # MAV_BATTERY_CHARGE_STATE by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
@@ -409,7 +409,7 @@ class _Reader:
 
     def _on_global_target(self, time_s: float, message: m.PositionTargetGlobalInt) -> None:
         if message.type_mask & _NO_POSITION != _NO_POSITION and (message.lat_int or message.lon_int):
-            frame = canonical_frame(message.coordinate_frame)  # an altitude above terrain stays unknown
+            frame = canonical_frame(message.coordinate_frame)  # altitudes above terrain are not recorded
             self._destinations.add(
                 time_s,
                 message.lat_int / _E7,

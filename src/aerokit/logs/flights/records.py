@@ -93,7 +93,7 @@ class TlogReader(LogReader):
         super().__init__(path)
         self._vehicles: dict[int, _VehicleStates] = {}
         self._framer = Framer()
-        # These show how an autopilot encodes parameters.
+        # The encoding of parameters depends on the autopilot and its capabilities.
         self._autopilots: dict[int, tuple[int, Autopilot]] = {}  # system id → component id and autopilot
         self._capabilities: dict[tuple[int, int], int] = {}  # (system id, component id) → capabilities
 
@@ -207,6 +207,6 @@ class _VehicleStates:
             may_have_texts = True
         cells = telemetry.cells
         states = tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)
-        if may_have_texts:  # There may be two: a complete one, and an earlier one whose last parts are missing.
+        if may_have_texts:  # An incomplete text may be published together with the next text.
             states += tuple(("status_text", text) for text in telemetry.texts_since(now))
         return states

@@ -75,7 +75,7 @@ MAX_PRINTED_ROWS = 60
 class Section:
     """A section of the report: title, explanation and parts.
 
-    If the log does not have the data, ``missing`` is shown instead.
+    ``missing`` replaces the explanation. It says which data the log lacks.
     """
 
     title: str
@@ -101,8 +101,8 @@ def page(
     """
     scripts = [import_module("plotly.offline").get_plotlyjs(), _resource("draw.js")]
     hashes = " ".join(f"'sha256-{_hash(script)}'" for script in scripts)
-    # The policy allows only the two included scripts, and no network access. Against hostile logs, it is a second
-    # barrier after escaping.
+    # The policy allows only the two included scripts, and no network access. It limits what a hostile log can do if its
+    # texts are not escaped correctly.
     policy = (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:;"
         " form-action 'none'; base-uri 'none'"

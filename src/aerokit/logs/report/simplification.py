@@ -24,8 +24,8 @@ def simplify(
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: maximum number of selected points. Some are always selected, even beyond it: those of ``keep``,
-            those next to a gap, the first, the last, and every 1024th point.
+        max_points: maximum number of selected points. It is exceeded if more points than this must be selected: those
+            of ``keep``, those next to a gap, the first, the last, and every 1024th point.
         tolerance: maximum distance of an omitted point from the line through the selected points. The distance may be
             larger if ``max_points`` is reached.
         keep: indices that are selected if their coordinates are known.
@@ -46,8 +46,8 @@ def simplify(
             selected.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
-    # A heap of segments: the negative square of the largest deviation from the segment, the index of the point that has
-    # it, and the first and last index of the segment. Negative, because heapq returns the smallest item first.
+    # A heap of segments: (negative square of the largest deviation, index of this point, first index, last index).
+    # heapq returns the smallest item first, so the square is negative.
     segments = [
         (*_deviation(places, first, last), first, last)
         for first, last in pairwise(sorted(selected))
@@ -83,7 +83,7 @@ def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> 
     for index in range(first + 1, last):
         point_x, point_y = places[index]
         dx, dy = point_x - x, point_y - y
-        if squared_length:  # replaces (dx, dy) by the distance vector from the segment's nearest point
+        if squared_length:  # measure from the nearest point of the segment instead of its beginning
             fraction = (dx * segment_x + dy * segment_y) / squared_length
             fraction = 0.0 if fraction < 0.0 else min(fraction, 1.0)
             dx, dy = dx - fraction * segment_x, dy - fraction * segment_y

@@ -253,7 +253,7 @@ def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _Des
 
 
 class _DescentValues(Snapshot):
-    """Minimum, median and maximum of a measurement in a descent; ``before`` is its median just before, or NaN."""
+    """Values of a measurement in a descent. ``before`` is the median shortly before the descent, or NaN."""
 
     minimum: float
     median: float
@@ -420,7 +420,7 @@ def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
     for kind in dict.fromkeys(kinds):
         names = failsafe_parameters(flight, kind)
         if not any(name in flight.parameters for name in names):
-            # Parameters with ACT or ENABL in their names choose the reaction. If there are none, return all names.
+            # Parameters with ACT or ENABL in their names choose the reaction.
             unknown += [name for name in names if "ACT" in name or "ENABL" in name] or names
     return unknown
 
