@@ -23,8 +23,7 @@ _MIN_BATCH_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
 # With more than `_BATCH_THRESHOLD` vehicles, the output of `_BATCH_INTERVAL_S` simulated seconds is sent together.
 _BATCH_INTERVAL_S = TICK_S
-# After the event loop was blocked, a simulation that does not run in real time executes at most this many of the missed
-# simulated seconds, and skips the others. In real time, it executes all of them.
+# Maximum simulated seconds to make up for after the event loop was blocked. In real time, there is no maximum.
 _MAX_CATCH_UP_S = 0.5
 
 
@@ -72,7 +71,7 @@ class SimulatorServer:
         runs_several_ticks_at_once = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD
         self._min_wait_s = _MIN_BATCH_WAIT_S if runs_several_ticks_at_once else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None  # None before the `async with` block
-        # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
+        # Removes the event source that replaces the timers on a `VirtualClockLoop`; None on any other loop.
         self._remove_source: Callable[[], None] | None = None
         self._started_at = 0.0  # loop time at the start
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)  # simulated time at the start
@@ -151,7 +150,7 @@ class SimulatorServer:
     def wake(self) -> None:
         """Run all events that are due. Call this method after a change of a fault or of a value of a vehicle.
 
-        Raises the exception of a vehicle that fails now or has failed before.
+        Raises the error of a failed vehicle, even if the vehicle failed earlier.
         """
         if self.failure is not None:
             raise self.failure
@@ -182,8 +181,7 @@ class SimulatorServer:
         for link in self._links:
             link.close()
         owner = self._owner
-        # The owner is cancelled, because asyncio would only log the exception of a callback.
-        # A fixture can enter the `async with` block in one task and leave it in another, so the owner may be done.
+        # asyncio only logs the exception of a callback, so the owner is cancelled. In a fixture, it may be done already.
         if owner is not None and not owner.done() and owner is not asyncio.current_task():
             self._cancels_owner = owner.cancel()
 
@@ -219,7 +217,7 @@ class SimulatorServer:
                 is_from_vehicle = False
                 self.on_datagram(now, data, is_from_vehicle)
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # The vehicle is ahead of `now` if a timer fired early, or if another vehicle advanced this vehicle.
+                # The vehicle's time is later than `now` if a timer fired early or another vehicle advanced it.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()  # All vehicles have used the decoded messages.
@@ -289,10 +287,7 @@ class _Port:
                 channel.reader = self.reader
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
-        """Return the datagrams to send.
-
-        With ``together``, a datagram may have messages of several vehicles, as behind a router.
-        """
+        """Return the datagrams to send. With ``together``, several vehicles of a fleet may share a datagram."""
         active = [channel for channel in self.channels if channel.has_output]
         if not active:
             return []

@@ -31,8 +31,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    As in ArduCopter, a change between position, velocity and acceleration targets resets the speed limits to
-    WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN. A speed that DO_CHANGE_SPEED has set is valid until this change.
+    DO_CHANGE_SPEED sets a speed limit. As in ArduCopter, another type of target (position, velocity or acceleration)
+    resets the limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
     """
 
     number: int = CopterMode.GUIDED

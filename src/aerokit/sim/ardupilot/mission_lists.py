@@ -137,8 +137,8 @@ class CommandList(ItemList):
             stored_item = as_stored(item, self._kind)
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
-            # Like the firmware, do not add `start` to the jump target or to the limit (AP_Filesystem_Mission.cpp,
-            # finish_upload_mission).
+            # The firmware checks the jump target against the length of the file, even if `start` is not 0
+            # (AP_Filesystem_Mission.cpp, finish_upload_mission).
             if stored_item.command == Cmd.DO_JUMP and not 0 < stored_item.param1 < len(items):
                 return MavMissionResult.ERROR
             result = self._write(seq + start, stored_item)

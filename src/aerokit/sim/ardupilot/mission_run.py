@@ -61,8 +61,7 @@ class MissionMode(ArduPilotMode):
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
     def on_disarmed(self) -> None:
-        # Disarming has reset the progress. If the mission is unfinished, `update` starts its first command again, and
-        # the disarmed vehicle waits on the ground.
+        # Disarming has reset the progress, so `update` starts the first command again. The disarmed vehicle waits.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 

@@ -143,12 +143,11 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
-        self._triggered &= self._lost  # Links that have returned can trigger again.
+        self._triggered &= self._lost  # A link that has returned can start the failsafe again.
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
-        # The text and the parameter are those of the link that is checked first, even if only the other link is lost
-        # (failsafe.cpp, failsafe_trigger).
+        # `name` is the link that was just checked, which is not always the lost one (failsafe.cpp, failsafe_trigger).
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
         rover.rc.release_overrides()

@@ -210,7 +210,7 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 class Px4Signing(VehicleSigning):
     """Message signing of PX4. A text reports a new key, and unsigned heartbeats are accepted.
 
-    The time stamp is stored only when a key is set. Version 1.16 does not support signing.
+    PX4 stores the time stamp only together with a new key. Version 1.16 does not support signing.
     """
 
     def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:
