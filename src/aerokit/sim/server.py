@@ -33,9 +33,8 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. If the loop was blocked, the server simulates the missed time afterwards. Heartbeats of the client are
-    missing from that time. If ``speedup`` is not 1, the server therefore simulates at most half a second of it, so
-    that the vehicles do not detect a link loss.
+    second. After the loop was blocked, the server simulates the missed time. With a ``speedup`` other than 1, it
+    simulates at most half a second of it, because missing heartbeats would look like a link loss.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
@@ -116,14 +115,14 @@ class SimulatorServer:
                 if add_source is not None:
                     self._remove_source = add_source(self._next_loop_time, self._on_due)
                 self._run(self.now)
-                self._exit = opening.pop_all()  # From now on, `__aexit__` closes the links instead of this block.
+                self._exit = opening.pop_all()  # keeps the links open until `__aexit__`
         except BaseException as error:
             self._end(error)
             raise
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
-        connected: set[int] = set()  # vehicles whose first channel is in use; `_channels` adds to them
+        connected: set[int] = set()  # ids of vehicles whose first channel is in use; filled by `_channels`
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
             opening.push_async_callback(port.close)
@@ -181,7 +180,7 @@ class SimulatorServer:
         for link in self._links:
             link.close()
         owner = self._owner
-        # asyncio only logs the exception of a callback, so the owner is cancelled. In a fixture, it may be done already.
+        # asyncio only logs the exception of a callback, so the owner is cancelled. In a fixture, it may be done.
         if owner is not None and not owner.done() and owner is not asyncio.current_task():
             self._cancels_owner = owner.cancel()
 

@@ -198,7 +198,7 @@ _Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
-    """Sensor calibrations. During those of ``compasses`` and ``accelerometers``, the vehicle must be turned by hand.
+    """Sensor calibrations. The vehicle must be turned by hand to calibrate compasses or accelerometers.
 
     PREFLIGHT_CALIBRATION is acknowledged at the end of the calibration. For the full calibration of the accelerometers,
     it is acknowledged when the first pose is requested.

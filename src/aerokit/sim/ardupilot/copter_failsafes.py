@@ -216,9 +216,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
                 self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
             self.has_estimator_failed = self._acted_on_estimator = False
             return
-        # The failsafe needs a position that was known before. While `has_estimator_failed` is True, the loss has
-        # been handled already.
-        if not self._had_position or self.has_estimator_failed:
+        if not self._had_position or self.has_estimator_failed:  # Act once, and only on the loss of a position.
             return
         lost_for_s = self._position_lost.seconds(condition=True, now=copter.now)
         if lost_for_s >= _ESTIMATOR_TIMEOUT_S:

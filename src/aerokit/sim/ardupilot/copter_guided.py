@@ -248,7 +248,7 @@ class CopterSetpoints:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_position_missing = point is None and Setpoint.of(target).has_position
-        # `_follow` ignores the point of a message that sets no position, so zero can replace an invalid point.
+        # Without a position in the message, `_follow` does not use the point.
         is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
         if not is_followed:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.

@@ -148,8 +148,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _check_end_of_long(self) -> None:
         parameters = self.vehicle.parameters
-        # The firmware uses the timeout of the short failsafe if this failsafe is enabled (system.cpp,
-        # check_long_failsafe).
+        # If the short failsafe is enabled, the firmware uses its timeout (system.cpp, check_long_failsafe).
         is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if is_short_enabled else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:

@@ -184,7 +184,7 @@ class ArduPilotMessageRequests:
             interval = group_interval
             if message_id == m.TerrainRequest.ID and rate > 0:
                 interval = max(interval, _MIN_TERRAIN_REQUEST_INTERVAL_S)
-            # Each NAMED_VALUE_FLOAT has only one of `DISPLAY_VALUES`. Every value is sent at the rate of the group.
+            # Each message contains the next one of `DISPLAY_VALUES`. The rate of the group is that of each value.
             elif message_id == m.NamedValueFloat.ID:
                 interval /= len(DISPLAY_VALUES)
             self._stream(message_id, interval, channel, first)

@@ -88,8 +88,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     """ArduRover's failsafes.
 
     FS_TIMEOUT seconds after the loss of the radio or the ground station, the rover executes FS_ACTION, armed or not.
-    In HOLD, it does so only with bit 0 of FS_OPTIONS, and in RTL never. As in the firmware, both links have one
-    failsafe. While the radio check is enabled, the text is "Radio Failsafe" even if only the ground station is lost.
+    In HOLD, the action requires bit 0 of FS_OPTIONS. In RTL, there is no action. While the radio check is enabled, the
+    text is "Radio Failsafe", even if only the ground station is lost.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
