@@ -30,7 +30,7 @@ _DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
 
 
 class SubArming(ArduPilotArming[SubHost]):
-    """ArduSub's arming checks. No check requires a position."""
+    """ArduSub's arming checks. By default, they do not require a position."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
