@@ -192,7 +192,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         raise NotImplementedError
 
     def on_speedup(self, speedup: float) -> None:
-        """Multiply the timeouts that no parameter sets. `aerokit.sim.kinds.scale_timeouts` calls this method."""
+        """Multiply the timeouts that are not parameters. Called by `aerokit.sim.kinds.scale_timeouts`."""
 
     def open_channel(self, *, version: int = 2) -> Channel:
         """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""

@@ -97,14 +97,14 @@ class SharedMessageReader(MessageReader):
 
 
 class _StreamGroup:
-    """Streams with the same interval that were started at the same time. Each has sent ``count`` messages."""
+    """Streams that were started at the same time with the same interval."""
 
     __slots__ = ("count", "ids", "interval_s", "start")
 
     def __init__(self, interval_s: float, start: float) -> None:
         self.interval_s = interval_s
         self.start = start
-        self.count = 0
+        self.count = 0  # number of messages that each stream has sent
         self.ids: list[int] = []
 
 
@@ -117,7 +117,7 @@ class Streams:
         self.next_due: float = math.inf
         """Time of the next message; infinity if no message is streamed."""
         self._groups: dict[int, _StreamGroup] = {}  # by message id
-        # Heap entries: (due time, number of the group, group). A group without ids stays until it is due.
+        # Heap entries: (due time, number of the group, group).
         self._heap: list[tuple[float, int, _StreamGroup]] = []
         self._group_count = 0
 

@@ -73,10 +73,9 @@ class Faults:
     mute_parameters: set[str] = field(default_factory=set)
     commands: dict[int, CommandFault] = field(default_factory=dict)
 
-    if not TYPE_CHECKING:  # If a type checker saw this method, it would no longer report misspelled names.
+    if not TYPE_CHECKING:  # Type checkers accept any name in a class with `__setattr__`.
 
         def __setattr__(self, name: str, value: object) -> None:
-            # Without this check, a misspelled fault would be accepted without an effect.
             if name not in self.__dataclass_fields__:
                 raise AttributeError(f"Faults has no fault {name!r}; faults: {', '.join(self.__dataclass_fields__)}")
             super().__setattr__(name, value)

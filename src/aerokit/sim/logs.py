@@ -28,7 +28,7 @@ _BLOCK = 90
 class SimulatedLog:
     """A log file of a simulated vehicle. Its content does not describe a flight.
 
-    The content is `SAMPLE_LOG`, then pseudo-random bytes. ``seed`` selects them; None uses size and time as the seed.
+    The content is `SAMPLE_LOG`, then pseudo-random bytes.
     """
 
     size: int
@@ -38,7 +38,7 @@ class SimulatedLog:
     """Seed of the pseudo-random content. If None, the content depends on size and time."""
 
     def make(self) -> bytes:
-        """Return the content. Of two logs with the same seed, the longer begins with the content of the shorter."""
+        """Return the content. A larger log with the same seed has the same first bytes."""
         words = math.ceil(self.size / 4)  # A word has 32 bits.
         return (SAMPLE_LOG + random.Random(self._content_seed).randbytes(4 * words))[: self.size]
 
@@ -76,7 +76,7 @@ class LogServer:
         # Functions that build the messages of the present transfer.
         self._outgoing: deque[Callable[[], Message]] = deque()
         self._channel: Channel | None = None  # where the present transfer is sent
-        self._transfer_number = 0  # Number of the present transfer. An earlier transfer sends nothing more.
+        self._transfer_number = 0  # number of the present transfer; scheduled calls for earlier transfers do nothing
         # Content of the log that was requested last, and the index of this log in `logs`; -1 if there is none.
         self._content = b""
         self._content_index = -1

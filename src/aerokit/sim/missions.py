@@ -112,8 +112,8 @@ class _Writer(UploadedFile):
             items = unpack_items(bytes(self.content[: header.length]))
         except (RemoteProtocolError, InvalidArgument):
             raise FileFault(EINVAL) from None
-        # ArduPilot rejects a file that has room for more items than its header announces, or an item whose bytes are
-        # all 0 (AP_Filesystem_Mission.cpp, finish_upload).
+        # ArduPilot rejects items that the header does not announce, and items whose bytes are all 0
+        # (AP_Filesystem_Mission.cpp, finish_upload).
         has_extra_item = len(self.content) >= header.length + MissionItemInt.LENGTH
         if has_extra_item or _EMPTY in items:
             raise FileFault(EINVAL)

@@ -86,9 +86,8 @@ _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
 BRAKING_SHARE = 0.7  # A vehicle plans to brake with 70 % of the acceleration limit, and keeps the rest in reserve.
 _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
-# Motion within these limits counts as steady, so steps of 0.12 s are exact enough. For example, a jerk of 4 m/s³ only
-# changes the position by 4 · 0.12³ / 6 m, which is 1.2 mm. Motion near the ground does not count as steady, because the
-# time and speed of a touchdown need short steps.
+# Within these limits, steps of 0.12 s are exact enough: a jerk of 4 m/s³ changes the position by 4 · 0.12³ / 6 m, which
+# is 1.2 mm. Near the ground, short steps are needed for the time and speed of a touchdown.
 _STEADY_JERK_M_S3 = 4.0
 _STEADY_LEAN_RATE_RAD_S = 0.6
 _MIN_TIME_TO_GROUND_S = 0.3

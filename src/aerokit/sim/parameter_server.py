@@ -134,7 +134,7 @@ class ArduPilotParameterServer(ParameterServer):
 
 
 def rounded(value: float, type_: int) -> float:
-    """Round a value for an integer parameter as ArduPilot does: add 0.01 away from zero, then truncate."""
+    """Round like ArduPilot: move the value of an integer parameter 0.01 away from zero, then truncate."""
     if type_ == MavParamType.REAL32:
         return value
     shifted = value + math.copysign(_ROUNDING_OFFSET, value)
@@ -189,7 +189,7 @@ class Px4ParameterServer(ParameterServer):
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name, parameters = request.param_id, self._parameters
-        if name == HASH_NAME:  # A client that knows the parameters already stops the list by this request.
+        if name == HASH_NAME:  # A client that has cached the parameters stops the list by this request.
             self.stop_list(channel)
         code = self._error_for(name, request.param_type)
         if code is not None:

@@ -176,7 +176,7 @@ def _row(fields: list[str]) -> SimParameter:
 
 
 def _switch_of(line: str) -> str | None:
-    """Return the last column of a line if it names an enabling parameter (`SimParameter.switch`)."""
+    """Return the name of the enabling parameter (last column), or None without one."""
     if line.count(",") < 4 or line.endswith("," + _VOLATILE):
         return None
     return line.rpartition(",")[2]
@@ -250,7 +250,7 @@ class _Reader(FileHandle):
         if self._with_defaults > 1 or max(self._start, self._count) >= 0xFFFF:
             raise FileFault(EINVAL)
         self._block = block or 0  # The block size; 0 means that the first read determines the size.
-        # Only PX4 has a fixed block size. PX4 does not divide a value and its default between two blocks.
+        # PX4 keeps a value and its default in the same block. Only PX4 passes `block`.
         self._whole_defaults = block is not None
         self._content: bytes | None = None  # the whole file; None before the first read
 

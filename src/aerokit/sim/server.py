@@ -23,8 +23,7 @@ _MIN_BATCH_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
 # With more than `_BATCH_THRESHOLD` vehicles, the output of `_BATCH_INTERVAL_S` simulated seconds is sent together.
 _BATCH_INTERVAL_S = TICK_S
-# After the event loop was blocked, a simulation that does not run in real time executes at most this many of the missed
-# simulated seconds, and skips the others. In real time, it executes all of them.
+# Maximum simulated seconds to make up for after the event loop was blocked. In real time, there is no maximum.
 _MAX_CATCH_UP_S = 0.5
 
 
@@ -34,9 +33,8 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. If the loop was blocked, the server simulates the missed time afterwards. Heartbeats of the client are
-    missing from that time. If ``speedup`` is not 1, the server therefore simulates at most half a second of it, so
-    that the vehicles do not detect a link loss.
+    second. After the loop was blocked, the server simulates the missed time. With a ``speedup`` other than 1, it
+    simulates at most half a second of it, because missing heartbeats would look like a link loss.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
@@ -72,7 +70,7 @@ class SimulatorServer:
         runs_several_ticks_at_once = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD
         self._min_wait_s = _MIN_BATCH_WAIT_S if runs_several_ticks_at_once else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None  # None before the `async with` block
-        # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
+        # Removes the event source that replaces the timers on a `VirtualClockLoop`; None on any other loop.
         self._remove_source: Callable[[], None] | None = None
         self._started_at = 0.0  # loop time at the start
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)  # simulated time at the start
@@ -117,14 +115,14 @@ class SimulatorServer:
                 if add_source is not None:
                     self._remove_source = add_source(self._next_loop_time, self._on_due)
                 self._run(self.now)
-                self._exit = opening.pop_all()  # From now on, `__aexit__` closes the links instead of this block.
+                self._exit = opening.pop_all()  # keeps the links open until `__aexit__`
         except BaseException as error:
             self._end(error)
             raise
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
-        connected: set[int] = set()  # vehicles whose first channel is in use; `_channels` adds to them
+        connected: set[int] = set()  # ids of vehicles whose first channel is in use; filled by `_channels`
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
             opening.push_async_callback(port.close)
@@ -151,7 +149,7 @@ class SimulatorServer:
     def wake(self) -> None:
         """Run all events that are due. Call this method after a change of a fault or of a value of a vehicle.
 
-        Raises the exception of a vehicle that fails now or has failed before.
+        Raises the error of a failed vehicle, even if the vehicle failed earlier.
         """
         if self.failure is not None:
             raise self.failure
@@ -182,8 +180,7 @@ class SimulatorServer:
         for link in self._links:
             link.close()
         owner = self._owner
-        # The owner is cancelled, because asyncio would only log the exception of a callback.
-        # A fixture can enter the `async with` block in one task and leave it in another, so the owner may be done.
+        # asyncio only logs the exception of a callback, so the owner is cancelled. In a fixture, it may be done.
         if owner is not None and not owner.done() and owner is not asyncio.current_task():
             self._cancels_owner = owner.cancel()
 
@@ -219,7 +216,7 @@ class SimulatorServer:
                 is_from_vehicle = False
                 self.on_datagram(now, data, is_from_vehicle)
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # The vehicle is ahead of `now` if a timer fired early, or if another vehicle advanced this vehicle.
+                # The vehicle's time is later than `now` if a timer fired early or another vehicle advanced it.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()  # All vehicles have used the decoded messages.
@@ -289,10 +286,7 @@ class _Port:
                 channel.reader = self.reader
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
-        """Return the datagrams to send.
-
-        With ``together``, a datagram may have messages of several vehicles, as behind a router.
-        """
+        """Return the datagrams to send. With ``together``, several vehicles of a fleet may share a datagram."""
         active = [channel for channel in self.channels if channel.has_output]
         if not active:
             return []

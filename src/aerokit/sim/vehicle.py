@@ -244,10 +244,9 @@ class SimulatedVehicle:
 
     @property
     def is_steady(self) -> bool:
-        """True while the motion changes so little that one long tick is as good as several short ticks.
+        """True while one long tick is as exact as several short ticks.
 
-        A long tick lasts at most 0.12 s. It ends before anything is received, streamed or due, so that samples are as
-        recent as with short ticks.
+        A long tick lasts at most 0.12 s. It ends before the next message or timer.
         """
         return False
 

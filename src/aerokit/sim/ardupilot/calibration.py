@@ -59,7 +59,7 @@ class AccelerometerCalibration:
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         is_first_position = position == AccelcalVehiclePos.LEVEL
-        if self.is_held_wrong and not is_first_position:  # A wrong pose is only noticed from the second position on.
+        if self.is_held_wrong and not is_first_position:  # A wrong first pose is not detected.
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
@@ -101,7 +101,7 @@ class CompassCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turning_time_s: float = 30.0
-        self._compass_mask = 0  # one bit for each compass in the calibration, until its result is accepted or cancelled
+        self._compass_mask = 0  # one bit for each compass whose result is not yet accepted or cancelled
         self._started_at = math.inf  # infinite before the start
         self._saves_at_once = False  # True if the result needs no DO_ACCEPT_MAG_CAL
         self._progress_compass = 0  # compass of the last progress message
@@ -198,7 +198,7 @@ _Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
-    """Sensor calibrations. During those of ``compasses`` and ``accelerometers``, the vehicle must be turned by hand.
+    """Sensor calibrations. The vehicle must be turned by hand to calibrate compasses or accelerometers.
 
     PREFLIGHT_CALIBRATION is acknowledged at the end of the calibration. For the full calibration of the accelerometers,
     it is acknowledged when the first pose is requested.

@@ -42,8 +42,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     }
     if vehicle.KIND != "sub":
         handlers[Cmd.DO_FOLLOW] = lambda command: Result.ACCEPTED if 0 < command.param1 <= 255 else Result.DENIED
-    # Each lambda reads the device again, because a reboot replaces the device objects. A reboot keeps `requests` and
-    # `calibrations`.
+    # A reboot replaces the device objects, so the lambdas look them up at each call.
     if vehicle.KIND in ("copter", "plane"):
         handlers[Cmd.AIRFRAME_CONFIGURATION] = lambda command: vehicle.devices.move_gear(command)
         handlers[Cmd.DO_PARACHUTE] = lambda command: vehicle.devices.handle_chute(command)

@@ -127,7 +127,7 @@ _refusing = partial(
     variant, CopterHold, is_available=False, needs_position=False, can_arm=False, entry_severity=MavSeverity.WARNING
 )
 
-# Modes in the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
+# Modes in the order of AVAILABLE_MODES. The firmware for quadrotors has neither SPORT nor AUTOROTATE.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     _refusing(
         CopterMode.AUTO_RTL, "AUTO RTL", entry_texts=("Unable to start landing sequence",),
@@ -284,8 +284,7 @@ class SimulatedCopter(CopterHost):
         if heading is None:
             return MavResult.FAILED
         direction = to_int(command.param3)
-        # A relative turn of more than 180 degrees must not take the shorter way (autoyaw.cpp). The direction 0 means
-        # clockwise in a relative turn.
+        # In a relative turn, the direction 0 means clockwise, even beyond 180 degrees (autoyaw.cpp).
         if command.param4 == 1.0:
             direction = direction or 1
         self.yaw.turn_to(heading, math.radians(command.param2), direction)

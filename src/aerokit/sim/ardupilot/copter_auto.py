@@ -111,7 +111,7 @@ class _CircleLeg:
 
 
 class _ClimbLeg:
-    """Take-off. On the ground, it waits for MISSION_START or a raised throttle, unless AUTO_OPTIONS skips the wait."""
+    """Take-off in a mission."""
 
     def __init__(self, auto: CopterAuto, altitude_m: float) -> None:
         self._copter, self._auto = auto.vehicle, auto
@@ -124,6 +124,7 @@ class _ClimbLeg:
     def update(self, dt: float) -> None:
         copter, auto = self._copter, self._auto
         options = int(copter.parameters["AUTO_OPTIONS"])
+        # On the ground, the copter waits for MISSION_START or a raised throttle.
         if copter.rc[RC_THROTTLE] > _RAISED_THROTTLE or options & _TAKE_OFF_WITHOUT_THROTTLE:
             auto.may_lift_off = True
         if not copter.is_landed or auto.may_lift_off:

@@ -16,7 +16,7 @@ _STICK_CENTER, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """ArduCopter's arming checks. Not all modes require a position. The throttle must be low or centered."""
+    """ArduCopter's arming checks."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
@@ -143,8 +143,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             return
         is_silent = copter.now - self.radio_received_at >= parameters["RC_FS_TIMEOUT"]
         self._radio_good_at = math.nan
-        # The radio is bad here. If pulses arrive (with a low throttle), the failsafe starts at once. If no pulses
-        # arrive, it starts after RC_FS_TIMEOUT.
+        # With a low throttle, the failsafe starts at once. Without pulses, it starts after RC_FS_TIMEOUT.
         if is_receiving or is_silent:
             self._set_radio_lost(is_lost=True)
 
@@ -217,9 +216,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
                 self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
             self.has_estimator_failed = self._acted_on_estimator = False
             return
-        # The failsafe needs a position that was known before. While `has_estimator_failed` is True, the loss has
-        # been handled already.
-        if not self._had_position or self.has_estimator_failed:
+        if not self._had_position or self.has_estimator_failed:  # Act once, and only on the loss of a position.
             return
         lost_for_s = self._position_lost.seconds(condition=True, now=copter.now)
         if lost_for_s >= _ESTIMATOR_TIMEOUT_S:
@@ -293,11 +290,7 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 
 
 class CopterFence(ArduPilotFence[CopterHost]):
-    """Executes FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL or RTL (3), BRAKE (4), SMART_RTL (5).
-
-    The copter changes to LAND if these modes are refused, or if it is more than 100 m outside the fence. On the
-    ground, values other than 0 disarm it.
-    """
+    """ArduCopter's fence. In flight, FENCE_ACTION selects the mode after a breach."""
 
     PERIOD_S: ClassVar[float] = 0.1
     CHECKS_DISARMED: ClassVar[bool] = True

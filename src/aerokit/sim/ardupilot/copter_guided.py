@@ -31,8 +31,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    As in ArduCopter, a change between position, velocity and acceleration targets resets the speed limits to
-    WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN. A speed that DO_CHANGE_SPEED has set is valid until this change.
+    DO_CHANGE_SPEED sets a speed limit. As in ArduCopter, another type of target (position, velocity or acceleration)
+    resets the limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
     """
 
     number: int = CopterMode.GUIDED
@@ -248,7 +248,7 @@ class CopterSetpoints:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_position_missing = point is None and Setpoint.of(target).has_position
-        # `_follow` ignores the point of a message that sets no position, so zero can replace an invalid point.
+        # Without a position in the message, `_follow` does not use the point.
         is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
         if not is_followed:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.

@@ -260,7 +260,7 @@ class CopterPilotedMode(CopterModeBase):
         self.vehicle.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        # With `must_navigate`, the mode must hold the horizontal position by itself: `needs_position` must be True.
+        # Only the modes that need a position can hold the horizontal position.
         if not self.takes_off or (must_navigate and not self.needs_position):
             return False
         self._take_off = CopterTakeOff(self.vehicle, altitude_m)

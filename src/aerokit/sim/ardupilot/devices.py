@@ -28,7 +28,7 @@ class ArduPilotDevices:
         self.line_m: float = 0.0  # Length of the winch's line.
         self.line_rate_m_s: float = 0.0  # Above 0 while the winch lets out line.
         self._goal_m: float | None = None  # Length at which the winch stops; None if it stops only on command.
-        self._has_scheduled_step = False  # True while a step is scheduled; RELAXED does not cancel the step
+        self._has_scheduled_step = False  # True while a step of the line is scheduled, even after RELAXED
 
     def _is_set(self, name: str) -> bool:
         return bool(self._vehicle.parameters.get(name, 0))

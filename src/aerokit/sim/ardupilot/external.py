@@ -22,7 +22,7 @@ _TARGET_TIMEOUT_S = 2.0
 
 
 class ArduPilotExternal:
-    """The latest measurement of each message type. Only poses (with VISO_TYPE) and landing targets have effects."""
+    """Measurements of external sensors. Only poses and landing targets affect the vehicle."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
@@ -49,7 +49,7 @@ class ArduPilotExternal:
         return self._vehicle.now - self._navigation_at
 
     def velocity_to_target(self) -> tuple[float, float]:
-        """Return the velocity (north, east) in m/s towards a landing target. It is zero if none was seen recently."""
+        """Return the velocity (north, east) in m/s towards the landing target, or zero without a recent target."""
         if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
             return (0.0, 0.0)
         north, east = self._target
@@ -73,7 +73,7 @@ class ArduPilotExternal:
         is_enabled = parameters.get("PLND_ENABLED", 0.0) and parameters.get("PLND_TYPE", 0.0) == _PLND_TYPE_MAVLINK
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
             return
-        if target.position_valid and not target.distance > 0:  # The firmware divides the position by the distance.
+        if target.position_valid and not target.distance > 0:  # The firmware would divide by 0.
             return
         self.latest[type(target)] = target
         # The offset of the target is relative to the nose, so it is rotated by the heading.

@@ -115,7 +115,7 @@ _MAX_ALT, _CIRCLE = int(FenceType.ALT_MAX), int(FenceType.CIRCLE)
 _POLYGON, _MIN_ALT = int(FenceType.POLYGON), int(FenceType.ALT_MIN)
 _NAMES = {_MAX_ALT: "Max Alt", _CIRCLE: "Circle", _POLYGON: "Polygon", _MIN_ALT: "Min Alt"}
 _ALL = _MAX_ALT | _CIRCLE | _POLYGON | _MIN_ALT
-# A breach counts as a new breach once the vehicle has moved this many metres farther outside.
+# Metres by which a breach must grow to count as a new breach.
 _BACKUP_M = 20.0
 _RECOVERY_DURATION_S = 10.0
 _STATUS_INTERVAL_S = 1.0
@@ -152,9 +152,9 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_time_ms: int = 0  # Start of the present or last breach, in ms since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
-        # Metres beyond the limit at which a breach counts as a new breach, by kind of fence.
+        # Metres beyond the limit at which the next breach counts, by kind of fence.
         self._new_breach_m: dict[int, float] = {}
-        self._floor_enabled_by_command: bool | None = None  # what the last command selected; None before
+        self._floor_enabled_by_command: bool | None = None  # value of the last command; None without a command
         self._recovering_since = -math.inf  # time of the last `recover_by_hand`
         self._reported_at = -math.inf  # time of the last FENCE_STATUS about a breach
         self._checked_at = -math.inf
@@ -257,7 +257,7 @@ class ArduPilotFence(Generic[HostT]):
         """Return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
-        is_floor_kept = self._floor_enabled_by_command is True  # Only another command disables it.
+        is_floor_kept = self._floor_enabled_by_command is True  # A command enabled the floor.
         if may_be_low and not is_floor_kept and self.enabled & _MIN_ALT:
             self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0

@@ -92,10 +92,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.session
 
     def _watch(self, peer: FtpPeer, session: FtpSession) -> None:
-        """Do nothing. The firmware closes an idle session only when another client needs the session."""
+        """Do nothing. The firmware closes an idle session only at a request for another session."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        # An idle session is closed for another session. A request to close sessions is never refused.
+        # A request for another session closes an idle session. Otherwise, the firmware refuses the request.
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
         if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():

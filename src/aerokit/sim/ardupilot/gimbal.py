@@ -163,7 +163,7 @@ class ArduPilotGimbal:
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn at these rates in degrees per second. With ``from_north``, a turn of the vehicle does not change yaw."""
+        """Turn at rates in degrees per second. With ``from_north``, yaw is relative to north, otherwise to the nose."""
         current = self.target
         current_yaw = self._from_nose(current)
         if from_north and current.is_from_north:

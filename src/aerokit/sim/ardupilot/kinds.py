@@ -17,7 +17,7 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
-    """Return all parameters of a firmware, or about ``count``. Those that the simulation reads are always included."""
+    """Return all or about ``count`` parameters of a firmware, including all that the simulation reads."""
     used = [name for (name,) in rows_of(kind, "used_parameters.csv")]
     return SimParameters.from_text(_read(f"{kind}.param.csv"), used=used, count=count)
 

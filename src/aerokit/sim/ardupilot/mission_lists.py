@@ -117,7 +117,7 @@ class CommandList(ItemList):
         if seq > count or not has_space:
             return MavMissionResult.ERROR
         if seq == count:
-            # In an empty list, the firmware stores home first, and even item 0 as item 1 (AP_Mission.cpp, add_cmd).
+            # If the list is empty, the firmware adds home first. Item 0 then becomes item 1 (AP_Mission.cpp, add_cmd).
             self.add_home()
             self._commands.append(stored_item)
         elif seq != _HOME_SEQ:  # Item 0 is home, which is not stored.
@@ -137,8 +137,8 @@ class CommandList(ItemList):
             stored_item = as_stored(item, self._kind)
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
-            # Like the firmware, do not add `start` to the jump target or to the limit (AP_Filesystem_Mission.cpp,
-            # finish_upload_mission).
+            # The firmware checks the jump target against the length of the file, even if `start` is not 0
+            # (AP_Filesystem_Mission.cpp, finish_upload_mission).
             if stored_item.command == Cmd.DO_JUMP and not 0 < stored_item.param1 < len(items):
                 return MavMissionResult.ERROR
             result = self._write(seq + start, stored_item)
@@ -216,7 +216,7 @@ Warn = Callable[[str], None]
 
 
 class FenceList(ItemList):
-    """The list of fence items. During an upload, `count` counts the new items, while `item` reads the old fence."""
+    """The list of fence items. During an upload, `item` still reads the old fence."""
 
     name = "Fence"
 

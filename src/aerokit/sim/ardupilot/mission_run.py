@@ -61,8 +61,7 @@ class MissionMode(ArduPilotMode):
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
     def on_disarmed(self) -> None:
-        # Disarming has reset the progress. If the mission is unfinished, `update` starts its first command again, and
-        # the disarmed vehicle waits on the ground.
+        # Disarming has reset the progress, so `update` starts the first command again. The disarmed vehicle waits.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 
@@ -247,7 +246,7 @@ class MissionRun:
             if is_navigation(command.item):
                 self.nav_index = command.seq
                 self._running_nav = command.item
-                self._state = MissionState.NOT_STARTED  # A COMPLETE mission would start again from its beginning.
+                self._state = MissionState.NOT_STARTED  # A mission that is COMPLETE cannot be resumed.
                 return True
             if self._running_do is None:
                 # The mission resumes at the first "do" command in front of the navigation command.
@@ -273,7 +272,7 @@ class MissionRun:
     def _start_next_navigation(self, start: int = 0) -> bool:
         """Start the next navigation command. Return False if there is none.
 
-        The search begins at the index ``start``. If that is 0, it begins after the current command.
+        The search begins at the index ``start``, or after the current command if ``start`` is 0.
         """
         index_after_current = self.nav_index + 1 if self.nav_index else _FIRST
         index = start or index_after_current

@@ -72,7 +72,7 @@ class ArduPilotMissionServer(MissionServer):
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
         if mission_type == MavMissionType.MISSION:
-            if clear:  # This fails while the mission runs. Like the firmware, write the items even then.
+            if clear:  # The firmware writes the items even if a running mission prevents the clearing.
                 self._clear_list(self.commands)
             return self.commands.write_file(list(items), start)
         # A fence and rally points are always replaced as a whole.

@@ -71,7 +71,7 @@ class PlaneEngine(ArduPilotMotors):
 _MIN_REST_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
-# Modes in the order of AVAILABLE_MODES. Modes for lifting rotors do not exist, as in the firmware with Q_ENABLE 0.
+# Modes in the order of AVAILABLE_MODES. With Q_ENABLE 0, the firmware has no modes for lifting rotors.
 _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(
         modes.PlanePilotedMode, PlaneMode.MANUAL, "MANUAL",

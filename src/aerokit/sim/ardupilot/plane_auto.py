@@ -281,8 +281,8 @@ class PlaneGuided(PlaneNavigatingMode):
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
-        # Roll and pitch are both used if all rates are ignored and the attitude is not. Otherwise, the firmware uses
-        # each angle whose rate is not ignored (GCS_MAVLink_Plane.cpp).
+        # If the message gives an attitude without rates, the firmware uses both angles. Otherwise, it uses each angle
+        # that has a rate (GCS_MAVLink_Plane.cpp).
         selects_all_angles = not mask & Mask.ATTITUDE_IGNORE and mask & _RATES == _RATES
         if selects_all_angles or not mask & Mask.BODY_ROLL_RATE_IGNORE:
             self._bank = _TimedValue(roll, now)

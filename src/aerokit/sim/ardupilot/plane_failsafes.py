@@ -14,7 +14,7 @@ from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.motion import Ned
 
 _NONE, _SHORT, _LONG, _GCS = range(4)
-# The radio is bad after `_RADIO_TIMEOUT_S` without pulses, or at a low throttle. `_MIN_BAD_S` later, it counts as lost.
+# Time without pulses after which the radio is bad, and time after which a bad radio counts as lost.
 _RADIO_TIMEOUT_S, _MIN_BAD_S = 1.0, 0.2
 # Values of FS_SHORT_ACTN, FS_LONG_ACTN and FS_GCS_ENABL, and of the battery actions.
 _SHORT_BEST_GUESS, _SHORT_FBWA, _SHORT_DISABLED, _SHORT_FBWB = 0, 2, 3, 4
@@ -113,7 +113,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         if mode in _PILOTED or (mode in _NAVIGATING and action != _SHORT_BEST_GUESS):
             plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))  # All other actions select CIRCLE.
         self._mode_after = plane.mode.number
-        if self._mode_after != self._mode_before:  # Some modes continue, and the mode change may fail.
+        if self._mode_after != self._mode_before:
             self.warn(f"RC Short Failsafe: switched to {plane.mode.name}")
         else:
             self.warn("RC Short Failsafe On")
@@ -148,8 +148,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _check_end_of_long(self) -> None:
         parameters = self.vehicle.parameters
-        # The firmware uses the timeout of the short failsafe if this failsafe is enabled (system.cpp,
-        # check_long_failsafe).
+        # If the short failsafe is enabled, the firmware uses its timeout (system.cpp, check_long_failsafe).
         is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if is_short_enabled else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:

@@ -52,7 +52,7 @@ class ArduPilotRadio:
             value, received_at = self._overrides[index]
             if value and self._vehicle.now - received_at < self._override_time():
                 return value
-        if index == RC_THROTTLE and self._failure == _LOW_THROTTLE:  # SIM_RC_FAIL simulates a receiver without signal.
+        if index == RC_THROTTLE and self._failure == _LOW_THROTTLE:  # set by SIM_RC_FAIL
             return _LOW_THROTTLE_PWM
         return self._sticks[index] if index < len(self._sticks) else 0
 
@@ -178,7 +178,7 @@ class SubJoystick(ArduPilotJoystick):
         scale = _SUB_SCALE * gain
         throttle_scale = 2 * scale * parameters.get("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTER - 500 * throttle_scale  # 500 is the middle of the axis z.
-        # Like the firmware, do not scale pitch and roll, and do not leave out an axis without a value (joystick.cpp).
+        # The firmware does not scale pitch and roll. It uses the value of a missing axis like any other (joystick.cpp).
         offsets = {
             SUB_PITCH: axes.s, SUB_ROLL: axes.t, RC_YAW: axes.r * scale, SUB_FORWARD: axes.x * scale,
             SUB_LATERAL: axes.y * scale,

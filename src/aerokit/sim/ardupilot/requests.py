@@ -36,7 +36,7 @@ _SUPPORTED_MESSAGES: dict[Kind, frozenset[int]] = {
     "sub": _ALL_KINDS,
 }
 
-# A stream may have at most 80 % of the rate of the main loop, which is 400 Hz (GCS_Common.cpp, cap_message_interval).
+# The fastest stream has 80 % of the rate of the main loop, which is 400 Hz (GCS_Common.cpp, cap_message_interval).
 _MIN_INTERVAL_S, _MAX_INTERVAL_S = 0.0025 / 0.8, 60.0
 _MODES_MONITOR_INTERVAL_S = 5.0
 _MAX_INTERVAL_ID = 0xFFFF  # MESSAGE_INTERVAL.message_id has 16 bits.
@@ -63,8 +63,7 @@ class ArduPilotMessageRequests:
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # The rate parameters that REQUEST_DATA_STREAM has changed, with the value that a reboot restores and the
-        # requested value.
+        # Rate parameters that REQUEST_DATA_STREAM has changed: (value after a reboot, requested value) by name.
         self._changed_rates: dict[str, tuple[float, int]] = {}
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)
@@ -170,7 +169,7 @@ class ArduPilotMessageRequests:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
-        # A reboot restores the value from before the first change, so a second change keeps the stored value.
+        # A second change keeps the value from before the first change.
         value_after_reboot, _ = self._changed_rates.get(name, (parameters[name], rate))
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
@@ -185,7 +184,7 @@ class ArduPilotMessageRequests:
             interval = group_interval
             if message_id == m.TerrainRequest.ID and rate > 0:
                 interval = max(interval, _MIN_TERRAIN_REQUEST_INTERVAL_S)
-            # Each NAMED_VALUE_FLOAT has only one of `DISPLAY_VALUES`. Every value is sent at the rate of the group.
+            # Each message contains the next one of `DISPLAY_VALUES`. The rate of the group is that of each value.
             elif message_id == m.NamedValueFloat.ID:
                 interval /= len(DISPLAY_VALUES)
             self._stream(message_id, interval, channel, first)

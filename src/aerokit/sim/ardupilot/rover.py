@@ -88,8 +88,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     """ArduRover's failsafes.
 
     FS_TIMEOUT seconds after the loss of the radio or the ground station, the rover executes FS_ACTION, armed or not.
-    In HOLD, it does so only with bit 0 of FS_OPTIONS, and in RTL never. As in the firmware, both links have one
-    failsafe. While the radio check is enabled, the text is "Radio Failsafe" even if only the ground station is lost.
+    In HOLD, the action requires bit 0 of FS_OPTIONS. In RTL, there is no action. While the radio check is enabled, the
+    text is "Radio Failsafe", even if only the ground station is lost.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -143,12 +143,11 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
-        self._triggered &= self._lost  # Links that have returned can trigger again.
+        self._triggered &= self._lost  # A link that has returned can start the failsafe again.
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
-        # The text and the parameter are those of the link that is checked first, even if only the other link is lost
-        # (failsafe.cpp, failsafe_trigger).
+        # `name` is the link that was just checked, which is not always the lost one (failsafe.cpp, failsafe_trigger).
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
         rover.rc.release_overrides()

@@ -54,7 +54,7 @@ class RoverHost(RoverSubVehicle):
         return distance <= _ARRIVED_M or has_just_passed
 
     def has_passed(self, place: Ned) -> bool:
-        """Return True within WP_RADIUS of a place, which is near enough to go on to the next place without a stop."""
+        """Return True within WP_RADIUS of a place that the vehicle passes without a stop."""
         return horizontal_distance(self, place) <= self.parameters["WP_RADIUS"]
 
 

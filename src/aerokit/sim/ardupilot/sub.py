@@ -30,10 +30,7 @@ _DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
 
 
 class SubArming(ArduPilotArming[SubHost]):
-    """ArduSub's arming checks. By default (ARMING_CHECK 448), they check radio and battery. None requires a position.
-
-    One of the joystick buttons must have a function that disarms.
-    """
+    """ArduSub's arming checks. By default, they do not require a position."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"

@@ -236,9 +236,9 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Return True if a message is for the autopilot: to this system or all systems, and to none of `components`.
+        """Return True if the autopilot processes a message. Messages to `components` or other systems return False.
 
-        As in the firmware (MAVLink_routing.cpp), the autopilot also processes messages to a component that is unknown.
+        As in the firmware (MAVLink_routing.cpp), messages to an unknown component return True.
         """
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and all(component != present.component_id for present in self.components)
@@ -260,7 +260,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
-        # With SITL's boot timeline, the delay is half a second. With a shorter timeline, the delay is also shorter.
+        # The delay is half a second with SITL's boot timeline.
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:

@@ -85,7 +85,7 @@ class SimulatedComponent:
         self._streams: MessageStreams = MessageStreams(self)
 
     def commands(self) -> dict[int, CommandHandler]:
-        """Return the handlers of the component's commands by MAV_CMD. `join` adds those of the message requests."""
+        """Return the handlers of the component's own commands by MAV_CMD."""
         return {}
 
     def builders(self) -> dict[int, Builder]:

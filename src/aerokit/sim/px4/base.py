@@ -240,7 +240,7 @@ class Px4Vehicle(Px4Host):
         self.reboot(math.inf)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a status text, and the event with its content if there is one. Both follow the answer to a command."""
+        """Queue a status text and its event, if it has one. They are sent after the answer to the present command."""
         self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
         text_id = self._next_text_id
@@ -287,8 +287,7 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
-        # A request for the present mode restarts the mission if this mode is MISSION. Otherwise, the vehicle stays at
-        # its present position.
+        # A request for the present mode restarts MISSION. In any other mode, the vehicle stays at its present position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:

@@ -102,7 +102,7 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 _FORCE_MAGIC = 21196.0
 _REBOOT_DELAY_S = 0.2
 _ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
-# In the x and y of COMMAND_INT, INT32_MAX means "unspecified". PX4 refuses the upper 32 bits of a double NaN there.
+# In the x and y of COMMAND_INT, INT32_MAX means "unspecified". PX4 refuses 0x7FF80000, the upper half of a double NaN.
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 # In the floats of COMMAND_LONG, INT32_MAX is rounded to 2^31. PX4 refuses 2^31 and the floats next to it
 # (mavlink_receiver.cpp, handle_message_command_long).
@@ -296,7 +296,7 @@ class _Flight:
             return MavResult.DENIED
         if not px4.is_armed:
             self._tuning_since = math.nan
-        elif not self._tuning_since >= px4.arming.armed_at:  # not started (NaN), or before the last arming
+        elif not self._tuning_since >= px4.arming.armed_at:  # no tuning since the last arming
             self._tuning_since = px4.now
         # The last step waits for disarming (MC_AT_APPLY 1).
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed

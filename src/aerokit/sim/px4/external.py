@@ -22,7 +22,7 @@ _HORIZONTAL, _GPS_POSITION = 1, 1
 
 
 class Px4External:
-    """Keeps the newest measurement of each type. Only vision (EKF2_EV_CTRL) and landing targets have effects."""
+    """Measurements of external sensors. Only vision and landing targets affect the vehicle."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4

@@ -108,7 +108,7 @@ class Px4Flight:
         self.heading: float | None = None  # Heading in radians; None if the nose points in the direction of flight.
         self.speed_m_s: float = 0.0
         self.radius_m: float = 0.0  # Radius of the circle that a plane flies.
-        self.lifts_off: bool = False  # True if the mode wants to leave the ground.
+        self.lifts_off: bool = False  # True if the mode makes the vehicle leave the ground.
         self.manual_flight: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
@@ -137,8 +137,7 @@ class Px4Flight:
             self._vehicle.mission.enter()
 
     def stay_here(self) -> None:
-        # A target at the present place would make a moving vehicle fly back (navigator_main.cpp,
-        # preproject_stop_point).
+        # A moving vehicle would overshoot its present place and fly back (navigator_main.cpp, preproject_stop_point).
         self.target = self._vehicle.motion.stopping_place
 
     def update(self) -> None:

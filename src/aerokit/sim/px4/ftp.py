@@ -16,8 +16,8 @@ from aerokit.sim.vehicle import MessageHost
 class Px4Ftp(SessionFtpServer[FileTree]):
     """MAVFTP server of PX4. Every session has the number 0, and is closed after 10 s without a request.
 
-    A burst ignores the requested size. Only a directory listing clears the errno of the latest failure. Until then, for
-    example, every refusal after EEXIST reports FILEEXISTS. `Faults.no_ftp` turns the server off.
+    A burst ignores the requested size. A refusal may report the errno of an earlier failure, which only a directory
+    listing clears. `Faults.no_ftp` turns the server off.
     """
 
     max_clients: ClassVar[int] = 1 << 16

@@ -82,7 +82,7 @@ def _stick_position(pulse_us: int) -> float:
 
 
 def curved(value: float, share: float, dead_zone: float = 0.0) -> float:
-    """Apply a dead zone (MPC_HOLD_DZ) and a curve with a cubic ``share`` (MPC_XY_MAN_EXPO) to a stick position."""
+    """Apply a dead zone and a curve to a stick position. ``share`` is 0 for a line, 1 for a cubic curve."""
     size = abs(value)
     if size <= dead_zone:
         return 0.0
@@ -184,7 +184,7 @@ class Px4ManualFlight:
         return (hover + throttle * thrust_range) / hover
 
     def _velocity_of_thrust(self) -> float:
-        """Return the target velocity (m/s down) that makes `Motion` accelerate as much as the thrust would."""
+        """Convert the thrust to a target velocity (m/s down) that gives the same vertical acceleration."""
         motion = self._px4.motion
         lift = self._thrust * math.cos(motion.roll) * math.cos(motion.pitch)
         return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _VELOCITY_TIME_CONSTANT_S

@@ -55,7 +55,7 @@ class _Link(ListUpload):
 
 
 class Px4MissionServer(MissionServer):
-    """Server of mission, fence and rally points, which all links share. Texts and results are those of the firmware."""
+    """PX4's server of missions, fences and rally points. All links share the stored items."""
 
     retry_interval_s: ClassVar[float] = 0.26
 
@@ -187,7 +187,7 @@ class Px4MissionServer(MissionServer):
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         link = self._link(channel)
-        # PX4 first ends a transfer whose next item is the number of stored items (mavlink_mission.cpp,
+        # PX4 ends a transfer if the number of its next item equals the number of stored items (mavlink_mission.cpp,
         # handle_mission_request_list). If this ends an upload, PX4 refuses other uploads until a download times out.
         if link.next == self.count(link.mission_type):
             link.state = TransferState.IDLE

@@ -157,8 +157,7 @@ class Px4Offboard:
 
     def fly(self) -> None:
         motion = self._vehicle.motion
-        # `fly` is called only in OFFBOARD. Without the limit, the first call after another mode would count the whole
-        # time in that mode.
+        # `fly` is called only in OFFBOARD. The limit leaves out the time in other modes.
         elapsed = min(MAX_TICK_S, self._vehicle.now - self._flown_at)
         self._flown_at = self._vehicle.now
         if self._attitude is not None:

@@ -191,7 +191,6 @@ def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
 
 
 def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    # The firmware applies special values to the system id (param 1) and to the component id (param 2) separately.
     requested = (to_int(command.param1), to_int(command.param2))
     system, component = map(_id_in_control, requested, gimbal.in_control, gimbal.own_ids, command.sender)
     gimbal.in_control = (system, component)

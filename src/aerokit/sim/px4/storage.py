@@ -47,10 +47,9 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 
 
 class Px4ParameterMount(ParameterPackMount):
-    """``@PARAM`` files of PX4. They differ from those of ArduPilot.
+    """``@PARAM`` files of PX4. Opening a file reports its exact size.
 
-    Opening a file reports its exact size. A block of 239 bytes never ends inside a value or a default. Uploaded
-    parameters are applied as they arrive.
+    A block of 239 bytes never ends inside a value or a default. Uploaded parameters are applied as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
@@ -210,7 +209,7 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 class Px4Signing(VehicleSigning):
     """Message signing of PX4. A text reports a new key, and unsigned heartbeats are accepted.
 
-    The time stamp is stored only when a key is set. Version 1.16 does not support signing.
+    PX4 stores the time stamp only together with a new key. Version 1.16 does not support signing.
     """
 
     def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:

@@ -81,7 +81,7 @@ _HEIGHT_REACHED_M = 10.0
 
 
 class Px4PlaneFlight(Px4Flight):
-    """Navigator of a plane. ``target`` is the center of the circle or the end of the straight line that it flies."""
+    """Navigator of a plane. ``target`` is the center of a circle or the end of a straight line."""
 
     def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
         super().__init__(plane)
