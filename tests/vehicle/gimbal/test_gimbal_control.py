@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import anyio
@@ -401,6 +401,21 @@ async def test_rates_are_streamed_and_end_with_zero(frame: Any) -> None:
         assert math.isnan(first.param1)
 
 
+@pytest.mark.parametrize("how", ["left", "raises"])
+async def test_zero_rate_that_overtakes_rates_is_sent_again(how: str) -> None:
+    async with with_gimbals(SimulatedGimbal()) as flight, flight.vehicle.gimbal.control():
+        with suppress(Boom):
+            async with flight.vehicle.gimbal.rates(-5.0, 10.0) as stream:
+                await stream.turn(-5.0, 10.0, 0.5)
+                if how == "raises":
+                    raise Boom
+        await anyio.sleep(0.5)
+        kinds = (m.CommandLong, m.GimbalManagerSetPitchyaw)
+        last = [message for _, message in flight.wire.sent if isinstance(message, kinds)][-1]
+        assert isinstance(last, m.GimbalManagerSetPitchyaw), "it has no acknowledgement, which could be mistaken"
+        assert (last.pitch_rate, last.yaw_rate) == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("how", ["raises", "is cancelled"])
 async def test_rates_cancelled_end_with_zero_without_waiting(how: str) -> None:
     gimbal = SimulatedGimbal()
@@ -604,7 +619,7 @@ async def test_px4_rates_use_set_attitude() -> None:
         async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
             await stream.turn(-5.0, 10.0, 1.0)
         assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
-        sent = flight.wire.last(m.GimbalManagerSetAttitude)
+        sent = flight.wire.all(m.GimbalManagerSetAttitude)[-2]  # The last one has the final rate of zero.
         assert all(map(math.isnan, sent.q))
         assert math.degrees(sent.angular_velocity_y) == pytest.approx(-5.0)
         assert math.degrees(sent.angular_velocity_z) == pytest.approx(10.0)

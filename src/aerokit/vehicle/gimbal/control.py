@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from aerokit.mavlink.message import Message
     from aerokit.vehicle.gimbal.device import GimbalControllers, GimbalDevice
 
 __all__ = ["GimbalControl"]
@@ -40,17 +41,24 @@ class ReleaseCommand:
 
     If the vehicle is silent, the command is sent at the next HEARTBEAT. ``is_still_due`` is checked before each
     attempt, so that the command does not undo a newer order or the control of another station. If the gimbal manager
-    has fallen silent, the command is sent once more at its next HEARTBEAT.
+    has fallen silent, the command is sent once more at its next HEARTBEAT. ``final_message`` is sent after the
+    acknowledgement.
     """
 
     def __init__(
-        self, orders: GimbalOrders, command: int, params: tuple[float, ...], is_still_due: Callable[[], bool]
+        self,
+        orders: GimbalOrders,
+        command: int,
+        params: tuple[float, ...],
+        is_still_due: Callable[[], bool],
+        final_message: Message | None = None,
     ) -> None:
         self._orders = orders
         self._session = orders.session
         self._command = command
         self._params = params
         self._is_still_due = is_still_due
+        self._final_message = final_message
         # Component id of the manager when this object was created; another manager may be known later.
         self._target = orders.manager_id
 
@@ -122,6 +130,8 @@ class ReleaseCommand:
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
                 was_just_sent=True,
             )
+        if self._final_message is not None and self._session.is_open and self._is_still_due():
+            self._session.connection.send(self._final_message)
 
     def _is_target_silent(self) -> bool:
         is_autopilot = self._target == self._session.component_id

@@ -179,7 +179,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         def is_still_due() -> bool:
             return order is not None and order.is_newest and not orders.is_taken
 
-        return ReleaseCommand(orders, PITCHYAW, params, is_still_due)
+        # The command may overtake a message with an earlier rate, so a message with a rate of zero follows.
+        return ReleaseCommand(orders, PITCHYAW, params, is_still_due, final_message=self._encode_rates((0.0, 0.0)))
 
     def _finish(self) -> None:
         self._stop("the block of the vehicle has ended")
