@@ -194,7 +194,8 @@ class ParameterWrites(ParameterRequests):
     - The requested value with the requested type: the write is complete.
     - No answer: the value is read.
     - The old value: PARAM_SET is sent again, because it may have been lost. If the vehicle reports the old value eight
-      times in a row, and still after a second, it is the result. While the old value is unknown, every other value is treated like this.
+      times in a row, and still after a second, it is the result. While the old value is unknown, every other value is
+      treated like this.
     - Another value: the value is read again. PARAM_SET is not sent again, because it would undo the change if another
       station has set the value. A value reported twice in a row is the result.
 

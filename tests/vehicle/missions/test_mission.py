@@ -198,6 +198,20 @@ async def test_px4_mission_of_a_second_has_finished() -> None:
         await mission.wait_finished(timeout=30)
 
 
+async def test_px4_mission_of_disarmed_vehicle_is_not_started() -> None:
+    """One HEARTBEAT reports the mode and the disarming, as after a landing while the program starts a mission."""
+    async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
+        flight.px4.faults.lose(m.Heartbeat, times=2)
+        flight.px4.faults.lose(m.CurrentMode, times=5)
+        starting = asyncio.ensure_future(flight.vehicle.mission.start())
+        while flight.px4.mode != px4_modes.MISSION:  # noqa: ASYNC110
+            await anyio.sleep(0.01)
+        flight.px4.arming.disarm("a pilot", force=True)
+        with pytest.raises(OperationRejected, match="not started: the vehicle disarmed"):
+            await starting
+
+
 async def test_px4_finished_mission_cannot_be_resumed() -> None:
     async with armed(open_px4) as flight:
         mission = flight.vehicle.mission

@@ -253,8 +253,8 @@ class FlightActions(VehicleBase):
         try:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
         except OperationRejected:
-            # After a landing, PX4 disarms and changes to LOITER, which ends the order. The vehicle is then on the ground,
-            # as ordered. A refusal does not end the order.
+            # After a landing, PX4 disarms and changes to LOITER, which ends the order. The vehicle is then on the
+            # ground, as ordered. A refusal does not end the order.
             is_down = self.telemetry.is_confirmed_disarmed or is_reported_on_ground(self.telemetry)
             if not (order.end and is_down and order.is_newest):
                 raise
