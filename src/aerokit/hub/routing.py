@@ -421,7 +421,7 @@ class Router(Generic[PortT]):
         return numbers
 
     def _is_redundant(self, number: int, sender: Sender) -> bool:
-        """Return True if this port reaches no autopilot that still needs a command of ``sender``."""
+        """Return True if all autopilots at this port get the command of ``sender`` through another port, or sent it."""
         here = [autopilot for autopilot in self._senders.values() if autopilot.is_autopilot and autopilot.is_at(number)]
         return sender in here or (bool(here) and all(autopilot.port_number != number for autopilot in here))
 

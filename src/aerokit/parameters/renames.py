@@ -99,7 +99,10 @@ class Renamed(Snapshot):
         return self._convert(value, self.name)
 
     def parameter(self, parameter: Parameter) -> Parameter:
-        """Convert the vehicle's parameter to the requested name and units. A scaled value becomes a REAL32."""
+        """Return the vehicle's parameter with the name and units that the program asked for.
+
+        A scaled value becomes a REAL32.
+        """
         default = None if parameter.default is None else self.to_requested(parameter.default)
         converted = parameter.replace(name=self.requested, value=self.to_requested(parameter.value), default=default)
         if self.rename.divisor == 1 or not self._has_other_units:

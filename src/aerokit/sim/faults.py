@@ -35,8 +35,8 @@ class CommandFault:
 class Faults:
     """Faults of a vehicle or component, initially all off. A change takes effect at the next message or step.
 
-    - ``gps_lost``: no GPS fix. ArduPilot's estimator drops its position after seven seconds, PX4's at once; PX4 ends a
-      mode that needs a position after five seconds
+    - ``gps_lost``: no GPS fix. ArduPilot's estimator drops its position after seven seconds, PX4's at once. After five
+      seconds, PX4 leaves a mode that needs a position
     - ``rc_lost``: the pilot's transmitter is off; the failsafes of the vehicle react
     - ``leak``: water in the hull of a submarine
     - ``heartbeats_stopped``: HEARTBEAT stops, all other streams continue

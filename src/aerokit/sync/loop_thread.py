@@ -108,10 +108,10 @@ class LoopThread:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run a function, and cancel it after Ctrl-C.
+        """Run a function. After Ctrl-C, cancel it and wait until it has ended, for a limited time.
 
-        With ``must_start``, it is started even if Ctrl-C came first. With ``is_shielded``, the wait for its end has no
-        limit.
+        With ``is_shielded``, this wait has no limit. With ``must_start``, the function is started even if Ctrl-C came
+        first.
         """
         call: _Call[T] | None = None
         try:

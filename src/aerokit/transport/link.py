@@ -86,7 +86,7 @@ class PeerListener(Receiver, Protocol):
 
 
 def keeps_peers(receiver: Receiver) -> bool:
-    """Return True if the receiver decides which peers a link remembers."""
+    """Return True if the receiver, and not the link, chooses the peers to remember."""
     return isinstance(receiver, PeerKeeper) and receiver.keeps_peers
 
 

@@ -69,9 +69,9 @@ def _named_address(text: str) -> tuple[str, str]:
 
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:
-    """Parse ``MESSAGE,…[@NAME]`` into the endpoint and the patterns of message names.
+    """Parse ``MESSAGE,…[@ENDPOINT]`` into the endpoint's name and the patterns of message names.
 
-    The endpoint is "" for all endpoints.
+    Without ``@ENDPOINT``, which means all endpoints, the name is "".
     """
     names, at, endpoint = text.partition("@")
     patterns = tuple(name.strip() for name in names.split(",") if name.strip())

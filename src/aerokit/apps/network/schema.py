@@ -124,9 +124,9 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
 
 
 def _enum_schema(name: str) -> dict[str, Any] | None:
-    """Return the schema of a state or of a field ``Class.field`` with an enum value.
+    """Return the JSON schema of a value that is an enum; None if ``ENUMS`` does not list its name.
 
-    The result is None if ``ENUMS`` does not have the name.
+    The name is that of a state, or ``Class.field``.
     """
     enum = ENUMS.get(name)
     if enum is None:

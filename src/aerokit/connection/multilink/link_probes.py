@@ -134,7 +134,7 @@ class LinkProbes:
                 self._report_other_vehicle(frame, candidate)
 
     def _consume_budget(self, now: float) -> bool:
-        """Take a probe from the budget of the systems without a vehicle object. Return False if none is left."""
+        """Return True if one more system without a vehicle object may be probed now; their common rate is limited."""
         self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
         self._budget_at = now
         if self._budget < 1:

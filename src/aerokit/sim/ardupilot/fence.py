@@ -152,7 +152,7 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_time_ms: int = 0  # Start of the present or last breach, in ms since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
-        # Metres beyond the limit at which the next breach counts, by kind of fence.
+        # How many metres beyond the fence a vehicle must be to cause the next breach, by kind of fence.
         self._new_breach_m: dict[int, float] = {}
         self._floor_enabled_by_command: bool | None = None  # value of the last command; None without a command
         self._recovering_since = -math.inf  # time of the last `recover_by_hand`

@@ -122,9 +122,9 @@ class PlaneLanding:
         start_north, start_east, start_down = self._approach_start
         course = math.atan2(east - start_east, north - start_north)
         cos_course, sin_course = math.cos(course), math.sin(course)
-        # Distances in metres from the landing point: along the approach line (negative once the plane has passed the
-        # point), and across that line.
+        # Metres to the landing point along the approach line; negative once the plane has passed the point.
         remaining = (north - wing.north) * cos_course + (east - wing.east) * sin_course
+        # Metres from the plane to the approach line; positive if the line is on the right.
         aside = (east - wing.east) * cos_course - (north - wing.north) * sin_course
         # The flare starts below LAND_FLARE_ALT, or when the plane would touch down within LAND_FLARE_SEC.
         height, sink_rate = down - wing.down, wing.velocity_down

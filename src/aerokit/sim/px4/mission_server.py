@@ -42,7 +42,7 @@ class TransferState(Enum):
 
 @dataclass(eq=False)
 class _Link(ListUpload):
-    """Latest upload or download of a link. The firmware also uses these values after the end of the transfer."""
+    """State of the latest mission transfer on a link. PX4 still uses it after the transfer has ended."""
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0  # checksum of the items received so far
@@ -211,6 +211,7 @@ class Px4MissionServer(MissionServer):
         link.received_at = self._px4.now
         if request.seq == link.next and link.next < link.end:
             link.next += 1
+        # A request for the next item and a repeated request are now both for `next - 1`.
         if request.seq == link.next - 1 and request.seq < self.count(link.mission_type):
             self._send_item(link, request.seq)
         else:

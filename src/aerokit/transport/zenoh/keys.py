@@ -93,7 +93,7 @@ class KeySpace(Snapshot):
 
 
 class Beacon(Snapshot):
-    """Message that a vehicle side sends twice a second, with its clock."""
+    """Message that the process beside the vehicle sends twice a second, with the time of its clock."""
 
     epoch: int
     """Random number of this run of the vehicle side."""

@@ -214,7 +214,7 @@ class PhotoInterval:
         self._new_captures = CaptureQueue(self._log)
         # Index of the capture to deliver next.
         self._next_index: int | None = None
-        # The log's last reset for which `_next_index` is valid. After a newer reset, the camera counts from 0 again.
+        # Time of the log's last reset. After another reset, the camera counts from 0, so `_next_index` is set again.
         self._known_reset_at = self._log.reset_at
         # The last capture, if it may be the first one after a reset; see `_first_after_reset`.
         self._possible_first: Capture | None = None

@@ -65,7 +65,8 @@ class ReleaseCommand:
     async def send_and_wait(self, description: str) -> None:
         """Send the command and wait for its acknowledgement.
 
-        Raises OperationTimeout if the vehicle is silent. The command is then sent at the next HEARTBEAT.
+        If the vehicle is silent, raises OperationTimeout. A background task then sends the command at the next
+        HEARTBEAT.
         """
         if not self._is_still_due():
             return
