@@ -501,9 +501,10 @@ class MissionControl(VehiclePlan["Mission"]):
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         await self._order_mode(mode, order, timeout)
-        if order.end:  # The HEARTBEAT that reports the mode may also report that the vehicle has disarmed.
-            raise OperationRejected(f"the mission was not started: {order.end}")
         if self._session.telemetry.is_in(mode):
+            # After a landing, the HEARTBEAT that reports the mode may also report that the vehicle has disarmed.
+            if self._session.telemetry.is_confirmed_disarmed:
+                raise OperationRejected("the mission was not started: the vehicle disarmed")
             self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
 
     def _is_over(self, acknowledged_at: float) -> bool:
