@@ -119,7 +119,7 @@ class Px4(Autopilot):
     unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # Inside PX4, −1 A (-100) means "unknown".
     reposition_purpose: Purpose = "hold"
     holds_after_mission = True
-    mission_end_text = "Mission finished"  # mission_base.cpp
+    mission_end_text: str | None = "Mission finished"  # mission_base.cpp
     prearm_depends_on_mode = True
     # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
     runs_prearm_checks = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ class CheckedParameters:
         self.names = names
         self.confirmed: set[str] = set()  # names whose last write was confirmed
 
-    def calls(self) -> list[Callable[[], Coroutine[Any, Any, None]]]:
+    def calls(self) -> Sequence[Callable[[], Coroutine[Any, Any, None]]]:
         return [self.set, self.set, self.set_many, self.get, self.upload, self.temporarily, self.transaction]
 
     async def set(self) -> None:
@@ -136,7 +136,7 @@ async def test_reported_parameters_are_true_on_bad_links(seed: int, tmp_path: Pa
             async def reboot() -> None:
                 simulated.reboot(rng.uniform(0.5, 6))
 
-            async def call_randomly(choices: list[Callable[[], Coroutine[Any, Any, None]]], count: int) -> None:
+            async def call_randomly(choices: Sequence[Callable[[], Coroutine[Any, Any, None]]], count: int) -> None:
                 for _ in range(count):
                     with anyio.fail_after(MAX_CALL_S), anyio.CancelScope() as scope:
                         if rng.random() < 0.15:
