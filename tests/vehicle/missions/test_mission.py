@@ -212,6 +212,22 @@ async def test_px4_mission_of_disarmed_vehicle_is_not_started() -> None:
             await starting
 
 
+async def test_px4_old_completion_does_not_finish_mission_of_disarmed_vehicle() -> None:
+    """The vehicle disarms right after the start, and still reports the completion of the previous flight."""
+    async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
+        mission = flight.vehicle.mission
+        starting = asyncio.ensure_future(mission.start())
+        while flight.px4.mode != px4_modes.MISSION:  # noqa: ASYNC110
+            await anyio.sleep(0.01)
+        flight.px4.faults.lose(m.MissionCurrent, times=2)  # None reports the mission as active.
+        await starting
+        flight.px4.arming.disarm("a pilot", force=True)
+        flight.px4.mission.is_finished = True
+        with pytest.raises(OperationRejected, match="the vehicle is disarmed"):
+            await mission.wait_finished(timeout=60)
+
+
 async def test_px4_finished_mission_cannot_be_resumed() -> None:
     async with armed(open_px4) as flight:
         mission = flight.vehicle.mission
