@@ -180,7 +180,7 @@ class FlightActions(VehicleBase):
         started = self.connection.now()
 
         def missing_m() -> float:
-            if is_amsl:  # The ordered altitude stays when PX4 corrects the altitude of home in flight.
+            if is_amsl:  # PX4 keeps the ordered altitude (param7) when it corrects the altitude of home in flight.
                 return plan.params[6] - self._position.altitude_amsl()
             return altitude_m - self._position.altitude_relative()
 

@@ -200,17 +200,17 @@ class Health:
 
     def _checks_fail(self) -> bool:
         sensors = self._telemetry.sensors.latest
-        # In a mode that does not allow arming, PX4 reports what this mode requires, and not what arming requires.
-        is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
-        return sensors is not None and sensors.prearm_checks_pass is False and not is_meaningless
+        return sensors is not None and sensors.prearm_checks_pass is False and not self._reports_mode_requirements()
 
     def _failing_sensors(self) -> list[str]:
         sensors = self._telemetry.sensors.latest
-        # In a mode that does not allow arming, PX4 reports what this mode requires, and not what arming requires.
-        is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
-        if sensors is None or sensors.prearm_checks_pass is True or is_meaningless:
+        if sensors is None or sensors.prearm_checks_pass is True or self._reports_mode_requirements():
             return []
         return [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
+
+    def _reports_mode_requirements(self) -> bool:
+        # In a mode that does not allow arming, PX4 reports what this mode requires, and not what arming requires.
+        return self._autopilot.prearm_depends_on_mode and bool(self.unarmable_mode())
 
     def _is_required(self, sensor: str) -> bool:
         mode, modes_with_rc = self._telemetry.mode.latest, self._autopilot.modes_with_rc
