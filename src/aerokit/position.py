@@ -48,8 +48,10 @@ class Position(Snapshot):
 
     def _check(self) -> None:
         geo.check_place(self.latitude_deg, self.longitude_deg)
-        for name in ("altitude_amsl_m", "altitude_relative_m"):
-            altitude = getattr(self, name)
+        for name, altitude in (
+            ("altitude_amsl_m", self.altitude_amsl_m),
+            ("altitude_relative_m", self.altitude_relative_m),
+        ):
             if altitude is not None and not (isinstance(altitude, (float, int, Real)) and math.isfinite(altitude)):
                 raise InvalidArgument(f"{name} = {altitude!r} is not a finite number")
 

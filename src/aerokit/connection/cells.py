@@ -98,7 +98,8 @@ class StateCell(Generic[T]):
         self._updated_at = -math.inf
         self._arrivals = 0  # number of values set so far
         self._changes = 0  # number of values that differed from the value before
-        self._sinks: list[_Sink[T]] = []  # waiters and observers
+        # Waiters and observers. A new tuple replaces this one, because a sink that is called may add or remove sinks.
+        self._sinks: tuple[_Sink[T], ...] = ()
         self._followers = 0  # number of iterators
         self._feeds: tuple[Feed, ...] = ()  # decode pending messages before the cell is read
         self._close_error: BaseException | None = None  # set when no more values will arrive
@@ -225,9 +226,8 @@ class StateCell(Generic[T]):
         self._source = source
         self._updated_at = self._stamp()
         self._arrivals += 1
-        if self._sinks:
-            for sink in tuple(self._sinks):  # A copy, because a sink may remove itself.
-                sink.receive(value)
+        for sink in self._sinks:
+            sink.receive(value)
 
     def _add_age(self, seconds: float) -> None:
         self._catch_up()
@@ -239,7 +239,7 @@ class StateCell(Generic[T]):
         self._known = False
         self._source = None
         self._updated_at = -math.inf
-        for sink in tuple(self._sinks):
+        for sink in self._sinks:
             sink.forget()
 
     def _feed_from(self, *feeds: Feed) -> None:
@@ -253,7 +253,7 @@ class StateCell(Generic[T]):
         """Raise ``error`` in current and later waiters, because no more values will arrive. Reading still works."""
         if self._close_error is None:
             self._close_error = error
-            for sink in tuple(self._sinks):
+            for sink in self._sinks:
                 sink.fail(copy_exception(error))
 
     def _raise_if_closed(self) -> None:
@@ -267,11 +267,11 @@ class StateCell(Generic[T]):
 
     def _add(self, sink: _Sink[T]) -> None:
         self._catch_up()
-        self._sinks.append(sink)
+        self._sinks += (sink,)
         self._notify_feeds()
 
     def _remove(self, sink: _Sink[T]) -> None:
-        self._sinks.remove(sink)
+        self._sinks = tuple(other for other in self._sinks if other is not sink)
         self._notify_feeds()
 
     def _follow(self) -> None:

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from aerokit.mavlink.enums import MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import Heartbeat, Statustext
+from aerokit.mavlink.messages import Heartbeat, Statustext, Timesync
 from aerokit.protocols.servers.host import ServerHost
 from aerokit.protocols.servers.host import sender_of as sender_of
 from aerokit.sim.channel import NS_PER_S, Channel
@@ -28,6 +28,9 @@ TICK_S = 0.02
 _STEADY_TICKS = 6
 MAX_TICK_S = _STEADY_TICKS * TICK_S
 """Duration of the longest tick, in steady flight."""
+
+# Each ground station sends these messages all the time. They do not change what the vehicle does.
+_MESSAGES_WITHOUT_TARGETS = (Heartbeat.ID, Timesync.ID)
 
 _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
@@ -146,11 +149,14 @@ class SimulatedVehicle:
             return
         # In steady flight, ticks are long. End the present tick before the messages change the targets, and make the
         # next tick short.
-        self._tick_until(now)
+        may_change_targets = any(message.ID not in _MESSAGES_WITHOUT_TARGETS for message in messages)
+        if may_change_targets:
+            self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):
                 self._handle(message, channel)
-        self._schedule_tick(1)
+        if may_change_targets:
+            self._schedule_tick(1)
         self.step(now)
 
     def step(self, now: float) -> None:

@@ -85,7 +85,7 @@ async def test_autopilot_attitude_is_requested_while_pointing() -> None:
         await anyio.sleep(1.0)
         asked = flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
         of_it = [request.param2 for request in asked if request.param1 == m.GimbalDeviceAttitudeStatus.ID]
-        assert of_it == [250_000, 0]
+        assert of_it == [200_000, 0]
 
 
 async def test_point_from_north_without_default_rates_returns() -> None:

@@ -13,6 +13,8 @@ from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotHost, ConditionTime
 _OK, _LOW, _CRITICAL = 0, 1, 2
 # Names of the levels: `_NAMES` in parameter names, `_WORDS` in status texts.
 _NAMES = {_LOW: "LOW", _CRITICAL: "CRT"}
+# Parameters with the lowest voltage and charge of each level.
+_LIMITS = {_LOW: ("BATT_LOW_VOLT", "BATT_LOW_MAH"), _CRITICAL: ("BATT_CRT_VOLT", "BATT_CRT_MAH")}
 _WORDS = {_LOW: "low", _CRITICAL: "critical"}
 _PERIOD_S = 0.1
 
@@ -77,9 +79,9 @@ class BatteryFailsafe:
 
     def _low_quantities(self, level: int) -> tuple[bool, bool]:
         """Return (voltage is low, charge is low)."""
-        parameters, name = self._vehicle.parameters, _NAMES[level]
+        volts_name, mah_name = _LIMITS[level]
         # The value 0 of these parameters means that there is no limit.
-        min_volts, min_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
+        min_volts, min_mah = self._vehicle.parameters[volts_name], self._vehicle.parameters[mah_name]
         is_voltage_low = min_volts > 0 and self._vehicle.battery.voltage_v < min_volts
         is_charge_low = min_mah > 0 and self._remaining_mah() < min_mah
         return is_voltage_low, is_charge_low

@@ -57,9 +57,9 @@ def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
     mode = modes.TERMINATION if px4.arming.is_terminated else px4.mode
     base_mode = modes.MODES[mode].base_mode
     if px4.is_armed:
-        base_mode |= MavModeFlag.SAFETY_ARMED
+        base_mode |= MavModeFlag.SAFETY_ARMED.value  # Combinations of `IntFlag` members are slow.
     if mode == modes.OFFBOARD and px4.offboard.is_fresh:
-        base_mode |= MavModeFlag.STABILIZE_ENABLED
+        base_mode |= MavModeFlag.STABILIZE_ENABLED.value
     custom_mode = modes.custom_mode(px4.mode)  # A termination does not change the custom mode.
     return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base_mode, custom_mode, _state(px4), mavlink_version=3)
 

@@ -185,7 +185,7 @@ class MessageRates:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
                 self._watch(stream)
-            if self._most_urgent() is not None:
+            if any(stream.failures for stream in self._streams.values()):
                 self._has_due_streams.set()
 
     def close(self) -> None:

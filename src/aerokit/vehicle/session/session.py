@@ -114,7 +114,8 @@ async def _request(commands: CommandSender, message_id: int, *, attempt_timeout:
 STATUS_TEXT_DELAY_S = 0.3
 """Seconds to wait for status texts after a refusal."""
 
-ACTION_HZ = 4.0
+# It divides the 10 Hz of the position, so that these messages share datagrams with the position.
+ACTION_HZ = 5.0
 """Rate in Hz of the messages that an action waits for."""
 
 RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
