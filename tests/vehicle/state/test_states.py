@@ -43,10 +43,10 @@ def test_state_field_invalid_declaration_raises() -> None:
 @for_each("name", STATES)
 def test_states_are_on_both_vehicle_classes_and_documented(name: str) -> None:
     assert hasattr(aerokit.Vehicle, name)
-    assert hasattr(aerokit.sync.Vehicle, name)
+    assert hasattr(aerokit.sync.Vehicle, name), "it has no twin: run python -m aerokit.sync.generator"
     assert documentation()[name][1].endswith(".")
 
 
 def test_states_page_is_current() -> None:
     page = Path(__file__).parents[3] / "docs" / "states.md"
-    assert page.read_text(encoding="utf-8") == rendered(), "python -m aerokit.vehicle.state.table > docs/states.md"
+    assert page.read_text(encoding="utf-8") == rendered(), "run python -m aerokit.vehicle.state.table > docs/states.md"
