@@ -69,7 +69,7 @@ def rows() -> Iterator[Any]:
 
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("pairs", list(rows()))
-def test_loop_watch_error_is_raised(pairs: list[tuple[str, str]], tmp_path: Path) -> None:
+def test_documented_errors_are_raised(pairs: list[tuple[str, str]], tmp_path: Path) -> None:
     faults = run_virtual(faults_of(pairs, tmp_path))
     assert not faults, "\n".join(faults)
 
