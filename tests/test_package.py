@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +19,14 @@ import aerokit
 def test_public_names_are_importable(name: str) -> None:
     assert getattr(aerokit, name) is getattr(aerokit, name)
     assert name in dir(aerokit)
+
+
+@for_each("name", ["", ".hub", ".missions", ".onboard", ".parameters", ".sync", ".testing", ".transport"])
+def test_lazy_names_are_known_to_type_checkers(name: str) -> None:
+    package = importlib.import_module(f"aerokit{name}")
+    typed = set(re.findall(r" as (\w+)$", Path(str(package.__file__)).read_text(encoding="utf-8"), re.MULTILINE))
+    differing = typed.symmetric_difference(package.__all__)
+    assert not differing, f"write them in lazy_exports and in the imports above: {sorted(differing)}"
 
 
 def test_unknown_name_raises_attribute_error() -> None:

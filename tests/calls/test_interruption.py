@@ -73,8 +73,9 @@ def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingS
 
 def test_blocking_calls_are_all_in_table() -> None:
     calls, names = blocking_calls(), set(blocking_names())
-    assert sorted(names - calls.keys()) == []
-    assert sorted(calls.keys() - names) == []
+    missing, unknown = sorted(names - calls.keys()), sorted(calls.keys() - names)
+    assert not missing, f"add rows to tests/helpers/call_table.py or tests/calls/blocking_calls.py: {missing}"
+    assert not unknown, f"remove these rows, there are no such calls: {unknown}"
 
 
 def rows() -> list[Any]:

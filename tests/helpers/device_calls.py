@@ -38,22 +38,36 @@ FITTED = {"GRIP_ENABLE": 1.0, "LGR_ENABLE": 1.0, "CHUTE_ENABLED": 1.0, "WINCH_TY
 
 
 class DeviceCall(NamedTuple):
-    """An order to a device: its name in CALLS and in docs/reliability.md, the call, the MAV_CMD."""
+    """An order to a device: its name in CALLS, the call, the MAV_CMD, and an invalid call.
+
+    ``has_effect`` is True if the call waits for an effect after the acknowledgement.
+    """
 
     name: str
-    order: str
     give: Give
     command: int
     on: tuple[str, ...] = COPTER
     place: Place = anywhere
     wrong: Give | None = None
+    has_effect: bool = False
+
+    @property
+    def order(self) -> str:
+        """Name in docs/reliability.md: ``"gripper.grab"`` for ``"Gripper.grab"``."""
+        name = self.name.removeprefix("Vehicle.")
+        return name[0].lower() + name[1:]
 
     def errors(self) -> Table:
-        """Provocations of NotSupported, if one of the autopilots lacks the order."""
-        if self.on == BOTH:
-            return {}
-        absent = "px4" if self.on == COPTER else "ardupilot"
-        return {(self.name, "NotSupported"): Provocation(_do(self.give), self.place, on=absent)}
+        """Provocations of NotSupported, and of the errors while the call waits for the effect."""
+        do, rows = _do(self.give), {}
+        if self.on != BOTH:
+            absent = "px4" if self.on == COPTER else "ardupilot"
+            rows[self.name, "NotSupported"] = Provocation(do, self.place, on=absent)
+        if self.has_effect:
+            without_effect = _fitted(accepted(self.command))
+            rows[self.name, "OperationRejected"] = Provocation(_superseded(do, self.give), before=without_effect)
+            rows[self.name, "OperationTimeout"] = Provocation(do, before=without_effect)
+        return rows
 
 
 def fit(stage: Stage) -> None:
@@ -78,35 +92,32 @@ def _fail(v: Any, **changes: Any) -> Any:
 DEVICE_CALLS = (
     DeviceCall(
         "Actuators.set_servo",
-        "actuators.set_servo",
         lambda v: v.actuators.set_servo(9, 1600),
         C.DO_SET_SERVO,
         wrong=lambda v: v.actuators.set_servo(33, 1600),
+        has_effect=True,
     ),
     DeviceCall(
         "Actuators.repeat_servo",
-        "actuators.repeat_servo",
         lambda v: v.actuators.repeat_servo(9, 1600, count=2, period_s=1),
         C.DO_REPEAT_SERVO,
         wrong=lambda v: v.actuators.repeat_servo(9, 1600, count=0, period_s=1),
     ),
     DeviceCall(
         "Actuators.set_relay",
-        "actuators.set_relay",
         lambda v: v.actuators.set_relay(0, True),
         C.DO_SET_RELAY,
         wrong=lambda v: v.actuators.set_relay(16, True),
+        has_effect=True,
     ),
     DeviceCall(
         "Actuators.repeat_relay",
-        "actuators.repeat_relay",
         lambda v: v.actuators.repeat_relay(0, count=2, period_s=1),
         C.DO_REPEAT_RELAY,
         wrong=lambda v: v.actuators.repeat_relay(0, count=2, period_s=0),
     ),
     DeviceCall(
         "Actuators.set_actuator",
-        "actuators.set_actuator",
         lambda v: v.actuators.set_actuator(2, 0.5),
         C.DO_SET_ACTUATOR,
         PX4,
@@ -114,7 +125,6 @@ DEVICE_CALLS = (
     ),
     DeviceCall(
         "Actuators.set_actuators",
-        "actuators.set_actuators",
         lambda v: v.actuators.set_actuators(0.5, None, -1),
         C.DO_SET_ACTUATOR,
         PX4,
@@ -122,20 +132,17 @@ DEVICE_CALLS = (
     ),
     DeviceCall(
         "Actuators.raise_landing_gear",
-        "actuators.raise_landing_gear",
         lambda v: v.actuators.raise_landing_gear(),
         C.AIRFRAME_CONFIGURATION,
         place=airborne,
     ),
     DeviceCall(
         "Actuators.lower_landing_gear",
-        "actuators.lower_landing_gear",
         lambda v: v.actuators.lower_landing_gear(),
         C.AIRFRAME_CONFIGURATION,
     ),
     DeviceCall(
         "Actuators.test_motor",
-        "actuators.test_motor",
         _test_motor,
         C.DO_MOTOR_TEST,
         place=grounded,
@@ -143,30 +150,26 @@ DEVICE_CALLS = (
     ),
     DeviceCall(
         "Actuators.enable_parachute",
-        "actuators.enable_parachute",
         lambda v: v.actuators.enable_parachute(),
         C.DO_PARACHUTE,
     ),
-    DeviceCall("Gripper.grab", "gripper.grab", lambda v: v.gripper().grab(), C.DO_GRIPPER, BOTH),
-    DeviceCall("Gripper.release", "gripper.release", lambda v: v.gripper().release(), C.DO_GRIPPER, BOTH),
-    DeviceCall("Winch.relax", "winch.relax", lambda v: v.winch().relax(), C.DO_WINCH),
+    DeviceCall("Gripper.grab", lambda v: v.gripper().grab(), C.DO_GRIPPER, BOTH, has_effect=True),
+    DeviceCall("Gripper.release", lambda v: v.gripper().release(), C.DO_GRIPPER, BOTH, has_effect=True),
+    DeviceCall("Winch.relax", lambda v: v.winch().relax(), C.DO_WINCH),
     DeviceCall(
         "Winch.pay_out",
-        "winch.pay_out",
         lambda v: v.winch().pay_out(0.6),
         C.DO_WINCH,
         wrong=lambda v: v.winch().pay_out(1e5),
     ),
     DeviceCall(
         "Winch.set_rate",
-        "winch.set_rate",
         lambda v: v.winch().set_rate(0),
         C.DO_WINCH,
         wrong=lambda v: v.winch().set_rate(50),
     ),
     DeviceCall(
         "Vehicle.inject_failure",
-        "inject_failure",
         _fail,
         C.INJECT_FAILURE,
         PX4,
@@ -411,14 +414,6 @@ def _winch_errors(name: str) -> Table:
     return rows
 
 
-def _servo(v: Any) -> Any:
-    return v.actuators.set_servo(9, 1700)
-
-
-def _relay(v: Any) -> Any:
-    return v.actuators.set_relay(0, True)
-
-
 def _light(v: Any) -> Any:
     return v.actuators.set_lights(True)
 
@@ -427,31 +422,9 @@ def _pay_out(v: Any) -> Any:
     return v.winch().pay_out(50, timeout=30)
 
 
-def _gripper_errors(name: str) -> Table:
-    def move(v: Any) -> Any:
-        return getattr(v.gripper(), name)()
-
-    return {
-        (f"Gripper.{name}", "OperationRejected"): P(
-            _superseded(_do(move), move), before=_fitted(accepted(C.DO_GRIPPER))
-        ),
-        (f"Gripper.{name}", "OperationTimeout"): P(_do(move), before=_fitted(accepted(C.DO_GRIPPER))),
-    }
-
-
 DEVICE_ERRORS: Table = {
     **{key: row for call in DEVICE_CALLS for key, row in call.errors().items()},
     **{key: row for name in WINCH_ORDERS for key, row in _winch_errors(name).items()},
-    **_gripper_errors("grab"),
-    **_gripper_errors("release"),
-    ("Actuators.set_servo", "OperationRejected"): P(
-        _superseded(_do(_servo), _servo), before=_fitted(accepted(C.DO_SET_SERVO))
-    ),
-    ("Actuators.set_servo", "OperationTimeout"): P(_do(_servo), before=_fitted(accepted(C.DO_SET_SERVO))),
-    ("Actuators.set_relay", "OperationRejected"): P(
-        _superseded(_do(_relay), _relay), before=_fitted(accepted(C.DO_SET_RELAY))
-    ),
-    ("Actuators.set_relay", "OperationTimeout"): P(_do(_relay), before=_fitted(accepted(C.DO_SET_RELAY))),
     ("Actuators.raise_landing_gear", "OperationRejected"): P(_do(lambda v: v.actuators.raise_landing_gear()), grounded),
     ("Actuators.set_lights", "InvalidArgument"): P(_do(lambda v: v.actuators.set_lights(True, component_id=0))),
     ("Actuators.set_lights", "NotSupported"): P(_do(lambda v: v.actuators.set_lights(True, component_id=1))),

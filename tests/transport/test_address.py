@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import contextlib
 import string
+from pathlib import Path
+from typing import get_args
 
 import pytest
 from for_each import for_each
@@ -9,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerokit.errors import InvalidArgument
-from aerokit.transport.address import LinkAddress, LinkKind, parse_address
+from aerokit.transport.address import ACCEPTED_FORMS, LinkAddress, LinkKind, parse_address
 
 
 def udpin(host: str, port: int) -> LinkAddress:
@@ -86,6 +88,13 @@ ACCEPTED: list[tuple[str, LinkAddress]] = [
 def test_accepted(text: str, address: LinkAddress) -> None:
     assert parse_address(text) == address
     assert parse_address(str(address)) == address
+
+
+@for_each("kind", get_args(LinkKind))
+def test_kinds_are_all_documented(kind: str) -> None:
+    page = Path(__file__).parents[2] / "docs" / "addresses.md"
+    assert f"{kind}:" in ACCEPTED_FORMS, "add it to ACCEPTED_FORMS in address.py"
+    assert f"`{kind}:" in page.read_text(encoding="utf-8"), "add it to the table in docs/addresses.md"
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 
 from aerokit.errors import InvalidArgument
 from aerokit.transport import (
     Link,
+    PtyLink,
     Replay,
     SerialLink,
     TcpConnect,
@@ -17,6 +20,7 @@ from aerokit.transport import (
     create_link,
     parse_address,
 )
+from aerokit.transport.address import LinkKind
 
 LINKS: list[tuple[str, type[Link], str]] = [
     ("127.0.0.1:14550", UdpListen, "udpin:127.0.0.1:14550"),
@@ -31,6 +35,7 @@ LINKS: list[tuple[str, type[Link], str]] = [
     ("flight.tlog", Replay, "replay:flight.tlog"),
     ("zenoh://north/alpha?control=never&client=me", ZenohConnect, "zenoh://north/alpha"),
     ("zenohin:north/alpha?listen=tcp/127.0.0.1:0", ZenohListen, "zenohin://north/alpha"),
+    ("pty:/tmp/ttyV0", PtyLink, "pty:/tmp/ttyV0"),
     ("replay:flight.tlog?speed=max", Replay, "replay:flight.tlog?speed=inf"),
 ]
 
@@ -42,6 +47,11 @@ def test_each_address_makes_its_link(address: str, kind: type[Link], named: str)
     assert link.address == named
     assert create_link(parse_address(address), baud=921600).address == named
     link.close()
+
+
+def test_all_kinds_are_in_table() -> None:
+    missing = set(get_args(LinkKind)) - {parse_address(address).kind for address, _, _ in LINKS}
+    assert not missing, f"add these kinds to LINKS, and to create_link: {missing}"
 
 
 def test_wrong_address_shows_the_accepted_forms() -> None:

@@ -137,8 +137,6 @@ def render_docstring(text: str | None, indent: str = "        ") -> str:
 
 FILES = {name: Path(__file__).with_name(f"{name}.py") for name in ("twins", "fleet_twins", "component_twins")}
 
-FILE = FILES["twins"]
-
 # Base classes of twins whose type parameter is the asynchronous class, such as ``TwinOf[Vehicle]``.
 GENERIC_BASES = ("TwinOf", "BlockTwin", "SelectionTwin")
 

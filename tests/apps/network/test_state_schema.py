@@ -85,7 +85,7 @@ class Kept(Publisher):
 def test_schema_file_matches_types() -> None:
     path = Path(__file__).parents[3] / "docs" / "state.schema.json"
     assert path.read_text(encoding="utf-8") == rendered(), (
-        "python -m aerokit.apps.network.schema > docs/state.schema.json"
+        "run python -m aerokit.apps.network.schema > docs/state.schema.json"
     )
     assert json.loads(rendered()) == SCHEMA
 

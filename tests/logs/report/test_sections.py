@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from aerokit.logs.flights import FlightLog
+from aerokit.logs.report.comparing import _STATISTICS
 from aerokit.logs.report.page import Paragraphs, Section, Table
 from aerokit.logs.report.sections import SECTIONS
+from aerokit.logs.report.statistics import FlightStatistics
 
 
 def section_of(flight: FlightLog, title: str) -> Section:
@@ -40,6 +42,11 @@ def test_changes_by_autopilot_do_not_contradict_the_sentence_before() -> None:
     sentences = [text for part in paragraphs for text in part.lines]
     assert sentences[0] == "The log contains no change of a parameter by the pilot or a program."
     assert sentences[1].startswith("1 changes by the autopilot itself")
+
+
+def test_comparison_has_all_statistics() -> None:
+    missing = [name for name in FlightStatistics.__annotations__ if name not in _STATISTICS]
+    assert not missing, f"add them to _STATISTICS in comparing.py: {missing}"
 
 
 def test_link_section_of_bin_does_not_promise_lost_messages() -> None:

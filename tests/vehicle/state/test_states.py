@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from for_each import for_each
@@ -12,6 +13,7 @@ import aerokit.sync
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavPowerStatus
 from aerokit.vehicle.session.subscriber import subscription_rate_hz
+from aerokit.vehicle.state import condition, equipment, measurements, movement
 from aerokit.vehicle.state.equipment import Power
 from aerokit.vehicle.state.field import MessageSource, StateField
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES
@@ -43,10 +45,17 @@ def test_state_field_invalid_declaration_raises() -> None:
 @for_each("name", STATES)
 def test_states_are_on_both_vehicle_classes_and_documented(name: str) -> None:
     assert hasattr(aerokit.Vehicle, name)
-    assert hasattr(aerokit.sync.Vehicle, name)
+    assert hasattr(aerokit.sync.Vehicle, name), "it has no twin: run python -m aerokit.sync.generator"
     assert documentation()[name][1].endswith(".")
+
+
+@for_each("module", [condition, equipment, measurements, movement])
+def test_value_classes_are_all_exported(module: ModuleType) -> None:
+    classes = [name for name, item in vars(module).items() if getattr(item, "__module__", "") == module.__name__]
+    missing = [name for name in classes if name[0].isupper() and name not in module.__all__]
+    assert not missing, f"add them to __all__, so that the reference lists them: {missing}"
 
 
 def test_states_page_is_current() -> None:
     page = Path(__file__).parents[3] / "docs" / "states.md"
-    assert page.read_text(encoding="utf-8") == rendered(), "python -m aerokit.vehicle.state.table > docs/states.md"
+    assert page.read_text(encoding="utf-8") == rendered(), "run python -m aerokit.vehicle.state.table > docs/states.md"

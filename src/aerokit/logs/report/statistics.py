@@ -83,12 +83,10 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
     ]
     sink_rates = spans.known(flight.velocity, "down_m_s")
     tilts = [abs(angle) for name in ("roll_deg", "pitch_deg") for angle in spans.known(flight.attitude, name)]
-    voltages = _first_battery(flight, spans, "voltage_v")
-    remaining = _first_battery(flight, spans, "remaining_percent")
-    currents = _first_battery(flight, spans, "current_a")
-    first_gps = next((flight.gps[number] for number in sorted(flight.gps)), None)
-    satellites = [] if first_gps is None else spans.known(first_gps, "satellites")
-    hdops = [] if first_gps is None else spans.known(first_gps, "hdop")
+    voltages, remaining, currents = (
+        spans.known_of_first(flight.batteries, name) for name in ("voltage_v", "remaining_percent", "current_a")
+    )
+    satellites, hdops = (spans.known_of_first(flight.gps, name) for name in ("satellites", "hdop"))
     levels = [level for axis in "xyz" for level in spans.known(flight.vibration, f"{axis}_m_s2")]
     clips = spans.known(flight.vibration, "clips")
     ratios = [ratio for name in flight.estimator for ratio in spans.known(flight.estimator, name)]
@@ -156,6 +154,9 @@ class _ArmedSpans:
             known += [value for value in part if math.isfinite(value)]
         return known
 
+    def known_of_first(self, by_number: dict[int, TimeSeries], name: str) -> list[float]:
+        return self.known(by_number[min(by_number)], name) if by_number else []
+
     def mean(self, columns: TimeSeries, name: str) -> float | None:
         """Return the time-weighted average of a column in the spans."""
         times, values = columns.times, columns[name]
@@ -169,11 +170,6 @@ class _ArmedSpans:
                     total += values[row] * seconds
                     weight += seconds
         return total / weight if weight else None
-
-
-def _first_battery(flight: FlightLog, spans: _ArmedSpans, name: str) -> list[float]:
-    first = next((flight.batteries[number] for number in sorted(flight.batteries)), None)
-    return [] if first is None else spans.known(first, name)
 
 
 def _max(values: list[float]) -> float | None:

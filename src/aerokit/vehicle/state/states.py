@@ -1,8 +1,8 @@
 """All states of a vehicle, each declared once.
 
-To add a state, write its value class and its decoder (``movement.py``, ``equipment.py``, ``condition.py``), declare the
-state here, and document it below the declaration. Its cell, the attribute of both vehicle classes, its requested rate
-and its row in docs/states.md follow from the declaration.
+To add a state, write its value class and its decoder (``movement.py``, ``equipment.py``, ``condition.py``,
+``measurements.py``), declare the state here, and document it below the declaration. Its cell, the attribute of both
+vehicle classes, its requested rate and its row in docs/states.md follow from the declaration.
 """
 
 from __future__ import annotations

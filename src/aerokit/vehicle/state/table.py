@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -37,6 +38,7 @@ def documentation() -> dict[str, tuple[str, str]]:
             is_text = isinstance(next_node, ast.Expr) and isinstance(next_node.value, ast.Constant)
             text = str(next_node.value.value) if is_text else ""  # type: ignore[attr-defined]
             value_type = ast.unparse(declaration.annotation).removeprefix("StateField[").removesuffix("]")
+            value_type = re.sub(r"\w+\.", "", value_type)  # The names of modules are left out.
             type_and_text[declaration.target.id] = (value_type, text)
     return type_and_text
 
