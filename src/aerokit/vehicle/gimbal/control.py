@@ -104,8 +104,8 @@ class ReleaseCommand:
                     self._send()
                 try:
                     await self._confirm()
-                except CommandTimeout:
-                    if not self._is_target_silent():
+                except (CommandTimeout, OperationRejected) as error:
+                    if isinstance(error, CommandRejected) or not self._is_target_silent():
                         raise
                     # The target was silent, and may have missed the command. Send it again at the target's next
                     # HEARTBEAT. A late command does no harm: the manager ignores it if this program has lost control.
