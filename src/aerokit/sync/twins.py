@@ -1152,6 +1152,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
+            OperationRejected: another order was given before the answer.
         """
         self._loop.run(self.aio.stop_looking)
 
@@ -1985,6 +1986,7 @@ class Winch(TwinOf["AsyncWinch"]):
             NotSupported: the autopilot has no such order. Nothing was sent.
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: your program gave a newer order for this winch before the acknowledgement.
         """
         self._loop.run(self.aio.relax)
 

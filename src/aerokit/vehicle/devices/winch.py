@@ -59,6 +59,7 @@ class Winch(ReadOnly):
             NotSupported: the autopilot has no such order. Nothing was sent.
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: your program gave a newer order for this winch before the acknowledgement.
         """
         await self._send(WinchActions.RELAXED)
 
