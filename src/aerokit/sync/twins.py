@@ -1994,7 +1994,8 @@ class Winch(TwinOf["AsyncWinch"]):
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
         Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a second
-        one would pay out more line.
+        one would pay out more line. If the winch is turning already, it adds the length to that at which the command
+        arrives, and the call returns when the winch has stopped there.
 
         Args:
             length_m: metres, −1000 to 1000; negative values wind the line up.
