@@ -429,7 +429,7 @@ async def test_order_is_not_resent_to_silent_camera() -> None:
 
         camera.faults.silent = True
         await anyio.sleep(10)
-        with pytest.raises(CommandTimeout, match="no HEARTBEAT received since"):
+        with pytest.raises(CommandTimeout, match="no HEARTBEAT of component 100 received since"):
             await flight.vehicle.camera.zoom_to(50)
         assert sent() == 1
         camera.faults.silent = False

@@ -139,6 +139,12 @@ class CameraOrders:
                 # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
                 raise session.with_reasons(error, started_at) from None
+            except CommandTimeout as error:
+                if not self.is_autopilot_attached and arbiter.is_state_recent:
+                    # The rest of the text has the age of the autopilot's HEARTBEAT.
+                    source = f"no HEARTBEAT of component {self.component.component_id} "
+                    error.args = (str(error).replace("no HEARTBEAT ", source),)
+                raise
 
     async def order_once(
         self,
