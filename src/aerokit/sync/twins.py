@@ -2679,7 +2679,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, its mode changed meanwhile, or no item is left to fly (PX4).
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
             OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
                 was busy with a transfer of plans.
