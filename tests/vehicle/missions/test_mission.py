@@ -241,6 +241,22 @@ async def test_px4_finished_mission_cannot_be_resumed() -> None:
         assert flight.vehicle.mode_name == "LOITER"
 
 
+async def test_ardupilot_finished_mission_continues_only_when_resumed() -> None:
+    """AP_Mission.cpp, set_current_cmd, stops a completed mission."""
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        end = flight.copter.motion.place
+        await mission.set_current(1)
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "AUTO"
+        assert flight.copter.motion.place == pytest.approx(end, abs=0.1)
+        await mission.resume()
+        await mission.wait_finished(timeout=60)
+        assert mission.reached == 2
+
+
 async def go_home(vehicle: Vehicle) -> None:
     await vehicle.go_to(vehicle.home.value.position)
 

@@ -255,6 +255,9 @@ class MissionControl(VehiclePlan["Mission"]):
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Make ``item`` the current item. A vehicle that is flying its mission proceeds to it immediately.
 
+        A vehicle that has finished its mission stays where it is, also in its mission mode (ArduPilot), until you call
+        :meth:`resume`.
+
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
         without a position (a DO command) is executed; ``current`` then shows the item after it.
 
