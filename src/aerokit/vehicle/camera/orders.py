@@ -14,6 +14,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.protocols.command import command_name
+from aerokit.vehicle.commanding.arbiter import ACTION
 from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
@@ -194,16 +195,26 @@ class CameraOrders:
         answered = anyio.Event()
         errors: list[AerokitError] = []
 
+        async def send_stop(**options: Any) -> None:
+            while True:
+                action = self._context.arbiter.latest(ACTION)
+                try:
+                    return await self.command(command, *params, order=order, **options)
+                except CommandTimeout:
+                    # A newer flight action ends the retries of other orders. The operation must end all the same.
+                    if self._context.arbiter.latest(ACTION) is action or not order.is_newest:
+                        raise
+
         async def confirm() -> None:
             try:
                 if order.is_newest:
                     try:
-                        await self.command(command, *params, order=order, was_just_sent=True)
+                        await send_stop(was_just_sent=True)
                     except CommandTimeout:
                         if is_awaited:
                             raise
                         await self._session.wait_for_heartbeat()  # The command may have been lost in a silence.
-                        await self.command(command, *params, order=order)
+                        await send_stop()
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:
