@@ -127,7 +127,11 @@ class CameraOrders:
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
         # `sent.end` gives the reason once the command must no longer be repeated.
-        with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
+        is_repeated = options.get("attempts") != 1
+        with (
+            arbiter.auxiliary_order(order, is_repeated=is_repeated) as sent_order,
+            arbiter.sending(sent_order) as sent,
+        ):
             try:
                 await session.commands.send_long(
                     command,

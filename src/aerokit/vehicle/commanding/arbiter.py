@@ -178,8 +178,12 @@ class CommandArbiter:
     # ------------------------------------------------------------------ other orders, in blocks
 
     @contextmanager
-    def auxiliary_order(self, device_order: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
+    def auxiliary_order(
+        self, device_order: Order | None = None, *, ends_flight: bool = False, is_repeated: bool = True
+    ) -> Iterator[Order]:
         """Create an order that does not say where to fly (speed, home, arming …).
+
+        A newer action ends its repetition, unless its command is not repeated anyway (``is_repeated`` False).
 
         With ``device_order``, the new order is a part of it: a newer order about the same device ends both. Raises
         OperationRejected if a newer one was already given.
@@ -189,7 +193,7 @@ class CommandArbiter:
         # The vehicle may still change to the modes of the newest steering order.
         modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ending_topics
-        order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
+        order = self._create_order(modes, (*((ACTION,) if is_repeated else ()), *device_topics), ends_flight)
         self._orders.append(order)
         try:
             yield order
