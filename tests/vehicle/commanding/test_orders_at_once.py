@@ -241,3 +241,15 @@ async def test_unacknowledged_reboot_returns_when_vehicle_has_rebooted(is_replac
         uptime = copter.uptime
         await vehicle.reboot()
         assert copter.uptime < uptime
+
+
+async def test_raw_command_awaits_late_acknowledgement_despite_newer_action() -> None:
+    async with _copter(flies=False) as (copter, vehicle, _), anyio.create_task_group() as tasks:
+        copter.faults.delay_ack(MavCmd.DO_SET_RELAY, 2.0)
+
+        async def set_mode() -> None:
+            await anyio.sleep(0.3)
+            await vehicle.set_mode("LOITER")
+
+        tasks.start_soon(set_mode)
+        await vehicle.command(MavCmd.DO_SET_RELAY, 0, 1)

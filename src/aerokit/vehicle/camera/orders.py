@@ -14,7 +14,6 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.protocols.command import command_name
-from aerokit.vehicle.commanding.arbiter import ACTION
 from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
@@ -115,10 +114,19 @@ class CameraOrders:
             raise
         order.commit()
 
-    async def command(self, command: int, *params: float, order: Order | None = None, **options: Any) -> None:
+    async def command(
+        self,
+        command: int,
+        *params: float,
+        order: Order | None = None,
+        attempts: int | None = None,
+        is_stop: bool = False,
+        **options: Any,
+    ) -> None:
         """Send a command, retried according to docs/reliability.md.
 
-        A newer order about the same topic ends the retries of ``order``.
+        A newer order about the same topic ends the retries of ``order``. So does a newer action, unless the command is
+        sent only once or ``is_stop`` is True.
         """
         if order is not None and not order.is_newest:
             raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}", was_sent=False)
@@ -126,10 +134,10 @@ class CameraOrders:
             order.may_move = True  # From here on, the camera may execute the order.
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
+        ends_with_actions = attempts != 1 and not is_stop
         # `sent.end` gives the reason once the command must no longer be repeated.
-        is_repeated = options.get("attempts") != 1
         with (
-            arbiter.auxiliary_order(order, is_repeated=is_repeated) as sent_order,
+            arbiter.auxiliary_order(order, ends_with_actions=ends_with_actions) as sent_order,
             arbiter.sending(sent_order) as sent,
         ):
             try:
@@ -138,6 +146,7 @@ class CameraOrders:
                     *params,
                     component_id=self.component.component_id,
                     order_status=_ResendGuard(self, sent),
+                    attempts=attempts,
                     **options,
                 )
             except CommandRejected as error:
@@ -199,26 +208,16 @@ class CameraOrders:
         answered = anyio.Event()
         errors: list[AerokitError] = []
 
-        async def send_stop(**options: Any) -> None:
-            while True:
-                action = self._context.arbiter.latest(ACTION)
-                try:
-                    return await self.command(command, *params, order=order, **options)
-                except CommandTimeout:
-                    # A newer flight action ends the retries of other orders. The operation must end all the same.
-                    if self._context.arbiter.latest(ACTION) is action or not order.is_newest:
-                        raise
-
         async def confirm() -> None:
             try:
                 if order.is_newest:
                     try:
-                        await send_stop(was_just_sent=True)
+                        await self.command(command, *params, order=order, is_stop=True, was_just_sent=True)
                     except CommandTimeout:
                         if is_awaited:
                             raise
                         await self._session.wait_for_heartbeat()  # The command may have been lost in a silence.
-                        await send_stop()
+                        await self.command(command, *params, order=order, is_stop=True)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:

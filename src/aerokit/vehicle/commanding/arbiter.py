@@ -179,11 +179,12 @@ class CommandArbiter:
 
     @contextmanager
     def auxiliary_order(
-        self, device_order: Order | None = None, *, ends_flight: bool = False, is_repeated: bool = True
+        self, device_order: Order | None = None, *, ends_flight: bool = False, ends_with_actions: bool = True
     ) -> Iterator[Order]:
         """Create an order that does not say where to fly (speed, home, arming …).
 
-        A newer action ends its repetition, unless its command is not repeated anyway (``is_repeated`` False).
+        A newer action ends the order, unless ``ends_with_actions`` is False: for a command that is sent only once, and
+        for one that stops or releases a device.
 
         With ``device_order``, the new order is a part of it: a newer order about the same device ends both. Raises
         OperationRejected if a newer one was already given.
@@ -193,7 +194,8 @@ class CommandArbiter:
         # The vehicle may still change to the modes of the newest steering order.
         modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ending_topics
-        order = self._create_order(modes, (*((ACTION,) if is_repeated else ()), *device_topics), ends_flight)
+        action_topics = (ACTION,) if ends_with_actions else ()
+        order = self._create_order(modes, (*action_topics, *device_topics), ends_flight)
         self._orders.append(order)
         try:
             yield order

@@ -351,13 +351,16 @@ class ArmingActions(VehicleBase):
         # A reboot is detected by a time since boot that is shorter than before, so request the present one.
         self._session.link_watch.request_time()
         unanswered: CommandTimeout | OperationRejected | None = None
-        with self._session.watch.expecting_reboot(), self._arbiter.auxiliary_order() as order:
+        with (
+            self._session.watch.expecting_reboot(),
+            self._arbiter.auxiliary_order(ends_with_actions=False) as order,
+        ):
             try:
                 await self._order_reboot(order, force)
             except CommandRejected:
                 raise
             except (CommandTimeout, OperationRejected) as error:
-                # A newer order, or the reboot itself, ends the wait for the acknowledgement.
+                # The reboot itself ends the wait for the acknowledgement.
                 if not order.was_sent:
                     raise
                 unanswered = error

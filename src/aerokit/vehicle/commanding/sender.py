@@ -11,7 +11,7 @@ import anyio
 from aerokit._internal.arguments import check_range
 from aerokit.errors import CommandRejected, CommandTimeout, HeartbeatTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, rejection
+from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, allowed_attempts, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
 from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, MOTION, REQUEST_COMMANDS, SUPERSEDED
@@ -344,7 +344,8 @@ class OrderSender:
 
     async def auxiliary_command(self, command: int, *params: float, **options: Any) -> None:
         """Send a command that changes a setting and does not steer."""
-        with self._arbiter.auxiliary_order() as order:
+        is_repeatable = allowed_attempts(command, params) > 1
+        with self._arbiter.auxiliary_order(ends_with_actions=is_repeatable) as order:
             await self.send_long(order, command, *params, **options)
 
     # ---------------------------------------------------------------------------- raw commands
@@ -377,7 +378,7 @@ class OrderSender:
             if command == MavCmd.COMPONENT_ARM_DISARM:
                 armed = bool(params) and params[0] == 1  # A missing parameter is sent as 0.
             with (
-                self._raw_order(command, modes) as order,
+                self._raw_order(command, modes, is_repeatable=retries > 0) as order,
                 self._arbiter.sending(order, modes=modes, armed=armed) as sent,
             ):
                 return await send(command, *params, order_status=sent, **options)
@@ -386,10 +387,10 @@ class OrderSender:
             raise self._session.with_reasons(error, started) from None
 
     @contextmanager
-    def _raw_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
+    def _raw_order(self, command: int, modes: Collection[Mode], *, is_repeatable: bool) -> Iterator[Order]:
         subjects = CHANGED_BY_COMMAND.get(command, ())
         if subjects and subjects != ARM_ALONE:
             yield self._arbiter.raw_order(subjects, modes=modes)
         else:
-            with self._arbiter.auxiliary_order() as order:
+            with self._arbiter.auxiliary_order(ends_with_actions=is_repeatable) as order:
                 yield order

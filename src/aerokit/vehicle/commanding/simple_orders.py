@@ -130,8 +130,8 @@ class SimpleOrder(Snapshot):
             self.check_supported(context)
         if topic is not None and device_order is None:
             device_order = context.arbiter.device_order(topic)
-        is_repeated = allowed_attempts(self.command, params) > 1
-        with context.arbiter.auxiliary_order(device_order, is_repeated=is_repeated) as order:
+        is_repeatable = allowed_attempts(self.command, params) > 1
+        with context.arbiter.auxiliary_order(device_order, ends_with_actions=is_repeatable) as order:
             await context.sender.send_long(order, self.command, *params, component_id=component_id)
         if self.effect is not None:
             target = context.session.component_id if component_id is None else component_id

@@ -99,7 +99,7 @@ class TerminationActions(VehicleBase):
         if not self.autopilot.can_shut_down:
             raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
         self._session.check_disarmed("shutdown")
-        with self._arbiter.auxiliary_order() as order:
+        with self._arbiter.auxiliary_order(ends_with_actions=False) as order:
             try:
                 await self._sender.send_long(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
             except CommandRejected:

@@ -104,8 +104,8 @@ class ReleaseCommand:
                     self._send()
                 try:
                     await self._confirm()
-                except (CommandTimeout, OperationRejected) as error:
-                    if isinstance(error, CommandRejected) or not self._is_target_silent():
+                except CommandTimeout:
+                    if not self._is_target_silent():
                         raise
                     # The target was silent, and may have missed the command. Send it again at the target's next
                     # HEARTBEAT. A late command does no harm: the manager ignores it if this program has lost control.
@@ -120,25 +120,17 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
-        is_answered = False
-        while not is_answered:
-            with self._orders.context.arbiter.auxiliary_order() as order:
-                try:
-                    await self._orders.context.sender.send_long(
-                        order,
-                        self._command,
-                        *self._params,
-                        component_id=self._target,
-                        is_done=lambda: not self._is_still_due(),
-                        attempts=RELEASE_ATTEMPTS,
-                        attempt_timeout=ATTEMPT_TIMEOUT_S,
-                        was_just_sent=True,
-                    )
-                    is_answered = True
-                except OperationRejected:
-                    # A newer flight order ends the retries of other orders. The gimbal must be released all the same.
-                    if order.is_newest:
-                        raise
+        with self._orders.context.arbiter.auxiliary_order(ends_with_actions=False) as order:
+            await self._orders.context.sender.send_long(
+                order,
+                self._command,
+                *self._params,
+                component_id=self._target,
+                is_done=lambda: not self._is_still_due(),
+                attempts=RELEASE_ATTEMPTS,
+                attempt_timeout=ATTEMPT_TIMEOUT_S,
+                was_just_sent=True,
+            )
         if self._final_message is not None and self._session.is_open and self._is_still_due():
             self._session.connection.send(self._final_message)
 
