@@ -165,6 +165,15 @@ async def test_denial_after_stale_acceptance_ends_wait() -> None:
         assert now() - began < 2.0
 
 
+async def test_second_copy_of_denial_does_not_end_wait() -> None:
+    """The first copy made aerokit claim control and send the order again."""
+    async with mounted() as flight:
+        flight.copter.faults.refuse(PITCHYAW, times=1)
+        copy = m.CommandAck(PITCHYAW, MavResult.DENIED, 0, 0, *own_ids(flight))
+        asyncio.get_running_loop().call_later(0.5, flight.copter.send, copy)
+        await flight.vehicle.gimbal.point(-60.0, 0.0, tolerance_deg=1.0)
+
+
 async def test_vehicle_roi_ends_gimbal_wait() -> None:
     async with in_the_air(copter=copter_with_mount()) as flight:
         flight.copter.faults.ignore(PITCHYAW, times=1)

@@ -68,7 +68,8 @@ class CommandSender:
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
-        # The time and the MAV_RESULT of the last refusal for which no call waited.
+        # The time of the last refusal of a call. The time and the MAV_RESULT of the last refusal for which none waited.
+        self._refused_at: dict[_Key, float] = {}
         self._late_refusals: dict[_Key, tuple[float, int]] = {}
         self._is_closed = False
         self._detach_callbacks = (
@@ -307,6 +308,8 @@ class CommandSender:
             self._results[key] = ack.result
             if ack.result == MavResult.ACCEPTED and self._is_for_our_ids(ack):
                 self._accepted_at[key] = self._connection.now()
+            if ack.result != MavResult.ACCEPTED:
+                self._refused_at[key] = self._connection.now()
         if run is not None:
             run.receive(ack)
         elif is_answer and is_final:
@@ -315,5 +318,8 @@ class CommandSender:
             if not self._pending_acks[key]:
                 del self._pending_acks[key]
         elif is_final and ack.result != MavResult.ACCEPTED and key in self._results and self._is_for_our_ids(ack):
-            self._results[key] = ack.result
-            self._late_refusals[key] = self._connection.now(), ack.result
+            now = self._connection.now()
+            # After another refusal, this may be a copy of it.
+            if now - self._refused_at.get(key, -math.inf) > PENDING_ACK_TIMEOUT_S:
+                self._results[key] = ack.result
+                self._late_refusals[key] = now, ack.result
