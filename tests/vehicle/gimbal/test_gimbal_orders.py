@@ -167,10 +167,11 @@ async def test_denial_after_stale_acceptance_ends_wait() -> None:
 
 async def test_second_copy_of_denial_does_not_end_wait() -> None:
     """The first copy made aerokit claim control and send the order again."""
-    async with mounted() as flight:
-        flight.copter.faults.refuse(PITCHYAW, times=1)
+    gimbal = SimulatedGimbal(slew_deg_s=30.0)
+    async with with_gimbals(gimbal) as flight:
+        gimbal.faults.refuse(PITCHYAW, times=1)
         copy = m.CommandAck(PITCHYAW, MavResult.DENIED, 0, 0, *own_ids(flight))
-        asyncio.get_running_loop().call_later(0.5, flight.copter.send, copy)
+        asyncio.get_running_loop().call_later(1.0, gimbal.send, copy)
         await flight.vehicle.gimbal.point(-60.0, 0.0, tolerance_deg=1.0)
 
 
