@@ -11,7 +11,7 @@ import pytest
 from disturbed_link import Disturbances, DisturbedLink
 
 import aerokit
-from aerokit.errors import AerokitError, OperationRejected, SetpointStreamStopped
+from aerokit.errors import AerokitError, CommandTimeout, OperationRejected, SetpointStreamStopped
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.mavlink.messages import (
     CommandInt,
@@ -214,7 +214,7 @@ async def test_arm_replaced_by_disarm_promises_no_cleanup() -> None:
         assert "aerokit disarms it" not in str(raised.value)
 
 
-async def test_arm_replaced_by_flight_order_is_watched() -> None:
+async def test_arm_ended_by_flight_order_is_watched() -> None:
     async with _copter(flies=False) as (copter, vehicle, _), anyio.create_task_group() as tasks:
         copter.faults.ignore(MavCmd.COMPONENT_ARM_DISARM, times=1)
 
@@ -223,7 +223,7 @@ async def test_arm_replaced_by_flight_order_is_watched() -> None:
             await vehicle.set_mode("LOITER")
 
         tasks.start_soon(set_mode)
-        with pytest.raises(OperationRejected, match=r"another order was given.*aerokit disarms it"):
+        with pytest.raises(CommandTimeout, match=r"another order was given.*aerokit disarms it"):
             await vehicle.arm()
 
 

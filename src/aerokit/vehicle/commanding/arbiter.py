@@ -104,6 +104,11 @@ class CommandArbiter:
         is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
         return not order.is_withdrawn and not is_superseded
 
+    def is_replaced(self, order: Order) -> bool:
+        """Return True if a newer order is about the same topic; a newer action alone does not replace other orders."""
+        latest_orders = (self.latest(topic) for topic in order.ending_topics if topic != ACTION)
+        return any(latest is not None and latest.number > order.number for latest in latest_orders)
+
     def _register(self, order: Order, topics: Iterable[Topic]) -> None:
         self._latest.update(dict.fromkeys(topics, order))
 

@@ -219,9 +219,8 @@ class ArmingActions(VehicleBase):
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
             except (anyio.get_cancelled_exc_class(), AerokitError) as error:
-                is_replaced = isinstance(error, OperationRejected) and not order.is_newest
                 is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
-                if is_watched and (is_replaced or isinstance(error, CommandTimeout)):
+                if is_watched and isinstance(error, CommandTimeout):
                     error.args = (f"{error}; {self._arm_cleanup.hint()}",)
                 raise
 

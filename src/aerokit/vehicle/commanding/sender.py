@@ -132,7 +132,8 @@ class OrderSender:
         """Return the error to raise for a command without an answer."""
         if order.takeover_reason or (order.failsafe and order.end):  # Another party has ended the order.
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
-        if sent.end == SUPERSEDED:
+        is_overruled = sent.end == SUPERSEDED and order.is_newest  # arm by disarm, or the reverse
+        if is_overruled or self._arbiter.is_replaced(order):
             # A command in progress is awaited for a while after the newer order, so its error may not name that order.
             return OperationRejected(str(error) if SUPERSEDED in str(error) else f"{error}; {SUPERSEDED}")
         return error
