@@ -172,7 +172,10 @@ def plain_values(values: ParameterValues) -> dict[str, int | float]:
 def _same(left: float | None, right: float | None, tolerance: float) -> bool:
     if left is None or right is None:
         return left is right
-    return same_value(left, right) or abs(left - right) <= tolerance
+    try:
+        return same_value(left, right) or abs(left - right) <= tolerance
+    except OverflowError:  # An int is too large for a float.
+        return False
 
 
 def _text(value: float | None) -> str:

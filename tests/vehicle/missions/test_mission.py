@@ -234,8 +234,27 @@ async def test_px4_finished_mission_cannot_be_resumed() -> None:
         await mission.start()
         await mission.wait_finished(timeout=60)
         await anyio.sleep(3.0)
-        with pytest.raises(OperationTimeout, match="No valid mission available"):
+        began = now()
+        with pytest.raises(OperationRejected, match="does not fly its mission\n  - No valid mission available"):
             await mission.resume()
+        assert now() - began < 1.0
+        assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_ardupilot_finished_mission_continues_only_when_resumed() -> None:
+    """AP_Mission.cpp, set_current_cmd, stops a completed mission."""
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        end = flight.copter.motion.place
+        await mission.set_current(1)
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "AUTO"
+        assert flight.copter.motion.place == pytest.approx(end, abs=0.1)
+        await mission.resume()
+        await mission.wait_finished(timeout=60)
+        assert mission.reached == 2
 
 
 async def go_home(vehicle: Vehicle) -> None:

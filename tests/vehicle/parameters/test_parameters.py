@@ -940,6 +940,15 @@ def test_signalling_nan_bits_are_kept() -> None:
     assert not bits & 0x00400000
 
 
+def test_cache_with_default_that_is_no_number_is_ignored(tmp_path: Path) -> None:
+    cache = ParameterCache(tmp_path)
+    cache.save("vehicle", 1, ParameterTable([Parameter("A", 1.0, ParameterType.REAL32, 2.0)]))
+    path = tmp_path / "vehicle.json"
+    assert cache.load("vehicle", 1) is not None
+    path.write_text(path.read_text().replace("2.0", '"two"'))
+    assert cache.load("vehicle", 1) is None
+
+
 def test_cache_that_cannot_be_written_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def fail(*_: object) -> None:
         raise OSError("No space left on device")

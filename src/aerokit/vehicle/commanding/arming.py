@@ -218,13 +218,10 @@ class ArmingActions(VehicleBase):
                 )
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
-            except CommandTimeout as error:
-                if not error.was_sent:
-                    raise
-                self._arm_cleanup.watch(order, was_armed)
-                raise CommandTimeout(f"{error}; {self._arm_cleanup.hint()}") from None
-            except (anyio.get_cancelled_exc_class(), AerokitError):
-                self._arm_cleanup.watch(order, was_armed)
+            except (anyio.get_cancelled_exc_class(), AerokitError) as error:
+                is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
+                if is_watched and isinstance(error, CommandTimeout):
+                    error.args = (f"{error}; {self._arm_cleanup.hint()}",)
                 raise
 
     async def disarm(
@@ -352,12 +349,18 @@ class ArmingActions(VehicleBase):
         reboots_before = self._session.watch.reboots
         # A reboot is detected by a time since boot that is shorter than before, so request the present one.
         self._session.link_watch.request_time()
-        unanswered: CommandTimeout | None = None
-        with self._session.watch.expecting_reboot():
+        unanswered: CommandTimeout | OperationRejected | None = None
+        with (
+            self._session.watch.expecting_reboot(),
+            self._arbiter.auxiliary_order(ends_with_actions=False) as order,
+        ):
             try:
-                await self._order_reboot(force)
-            except CommandTimeout as error:
-                if not error.was_sent:
+                await self._order_reboot(order, force)
+            except CommandRejected:
+                raise
+            except (CommandTimeout, OperationRejected) as error:
+                # The reboot itself ends the wait for the acknowledgement.
+                if not order.was_sent:
                     raise
                 unanswered = error
             # A command that was not acknowledged was probably lost, so a wait shorter than the time-out is enough.
@@ -367,16 +370,17 @@ class ArmingActions(VehicleBase):
                 return
         # The vehicle has not rebooted in time.
         if unanswered is not None:
-            raise CommandTimeout(f"{unanswered}; the command is sent only once, and may still be executed")
+            unanswered.args = (f"{unanswered}; the command is sent only once, and may still be executed",)
+            raise unanswered
         raise OperationTimeout(
             f"reboot: the vehicle did not restart within {timeout:g} s; {self._session.describe_link()}"
         )
 
-    async def _order_reboot(self, force: bool) -> None:
+    async def _order_reboot(self, order: Order, force: bool) -> None:
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         # If only the acknowledgement is lost, a repetition would cause another reboot.
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ACK_TIMEOUT_S}
-        await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
+        await self._sender.send_long(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots_before: int) -> None:
         started = self.connection.now()

@@ -255,6 +255,9 @@ class MissionControl(VehiclePlan["Mission"]):
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Make ``item`` the current item. A vehicle that is flying its mission proceeds to it immediately.
 
+        A vehicle that has finished its mission stays where it is, also in its mission mode (ArduPilot), until you call
+        :meth:`resume`.
+
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
         without a position (a DO command) is executed; ``current`` then shows the item after it.
 
@@ -286,7 +289,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, its mode changed meanwhile, or no item is left to fly (PX4).
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
             OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
                 was busy with a transfer of plans.
@@ -513,12 +516,24 @@ class MissionControl(VehiclePlan["Mission"]):
         texts = self._session.texts_since(acknowledged_at)
         return self._tracker.is_complete and end_text is not None and any(end_text in text for text in texts)
 
+    def _refusals(self, order: Order) -> tuple[str, ...]:
+        """Return PX4's texts since the order that there is no mission to fly. PX4 has then left the mode again."""
+        refusal = self._session.autopilot.no_mission_text
+        texts = self._session.texts_since(order.given_at)
+        return tuple(text for text in texts if refusal is not None and refusal in text)
+
     async def _order_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle_context, session = self._vehicle_context, self._session
         if not session.autopilot.mission_starts_by_command:
             await vehicle_context.sender.change_mode(
-                mode, order, timeout, reported_since=order.given_at, is_over=self._is_over
+                mode,
+                order,
+                timeout,
+                reported_since=order.given_at,
+                is_over=lambda acknowledged_at: bool(self._refusals(order)) or self._is_over(acknowledged_at),
             )
+            if refusals := self._refusals(order):
+                raise OperationRejected("the vehicle does not fly its mission", reasons=refusals)
             return
         try:
             with vehicle_context.arbiter.changing_mode():

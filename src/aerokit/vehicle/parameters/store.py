@@ -225,7 +225,8 @@ def vehicle_key(autopilot: str, system_id: int, version: AutopilotVersion | None
 
 def _parameter(row: list[Any], index: int) -> Parameter:
     name, value, type_, default = row
-    if not isinstance(name, str) or not isinstance(value, (int, float)):
-        raise ValueError("the row does not begin with a name and a number")
+    is_default_valid = default is None or isinstance(default, (int, float))
+    if not isinstance(name, str) or not isinstance(value, (int, float)) or not is_default_valid:
+        raise ValueError("the row has no name, no number, or a default that is no number")
     kind = ParameterType(type_)
     return Parameter(name, int(value) if kind.is_integer else float(value), kind, default, index)
