@@ -215,7 +215,7 @@ class FrameReceiver:
             # are not in use.
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
-            if is_other_peer and not self._claims_route(framer, frame, peer):
+            if is_other_peer and not self._routes.try_move_route(frame, peer, is_signed=gate.has_verified(frame)):
                 continue
             if has_suspects and self._must_be_dropped(framer, frame):
                 continue
@@ -293,9 +293,6 @@ class FrameReceiver:
         if is_admitted and self._multilink is not None:
             self._multilink.copies.admit()
         return is_admitted
-
-    def _claims_route(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
-        return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
     def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:
         """Return True for frames of a second sender with the same ids, and for outdated heartbeats."""

@@ -169,7 +169,7 @@ class IdentityGuard:
         """
         if self._routes.arrived_on_other_peer(frame, peer):
             self._current_peer = peer
-            if not self._routes.claims_route(frame, peer, framer.counters_of(frame), is_signed=False):
+            if not self._routes.try_move_route(frame, peer, is_signed=False):
                 return False
         if frame.message_id == 0:  # HEARTBEAT
             self._heartbeat_at[peer] = frame.received_at
@@ -181,7 +181,7 @@ class IdentityGuard:
         self._routes.exclude_pause(now, paused_s)
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Return the first peer without a heartbeat in the last 30 s, and drop its claims to routes."""
+        """Forget the first peer without a heartbeat in the last 30 s, and return it."""
         silent = (peer for peer in peers if now - self._heartbeat_at.get(peer, -math.inf) > PEER_TTL_S)
         return self._routes.evict_idle_peer(silent, now)
 

@@ -181,8 +181,8 @@ class MultiLinkRoutes:
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
         return self._routes[_link_index(peer)].arrived_on_other_peer(frame, peer)
 
-    def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        return self._routes[_link_index(peer)].claims_route(frame, peer, counters, is_signed)
+    def try_move_route(self, frame: Frame, peer: Peer, *, is_signed: bool) -> bool:
+        return self._routes[_link_index(peer)].try_move_route(frame, peer, is_signed=is_signed)
 
     def record_duplicate_sender(self, frame: Frame) -> None:
         self._routes[0].record_duplicate_sender(frame)
