@@ -205,7 +205,7 @@ class FrameReceiver:
             if self._is_closed:  # A sink of an earlier frame has closed the connection.
                 return
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
-            if multilink is not None and multilink.is_copy(frame, peer, is_other_peer=is_other_peer):
+            if multilink is not None and multilink.is_duplicate(frame, peer, is_other_peer=is_other_peer):
                 continue
             # With several links, `_is_admitted` is called even if the gate is open, because it records the admission.
             must_check = multilink is not None or not gate.is_open
@@ -285,14 +285,12 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # If the same frame was admitted over another link, it is not checked again, because the check would refuse it
-        # as a replay. `copies` still refers to this frame, because `is_copy` was just called for it.
-        if self._multilink is not None and self._multilink.copies.was_admitted:
-            return True
-        is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
-        if is_admitted and self._multilink is not None:
-            self._multilink.copies.admit()
-        return is_admitted
+        if self._multilink is None:
+            return self._gate.admits(frame, may_hand_over=not is_other_peer)
+        current = self._multilink.copies.current  # the record of this frame
+        if not current.is_admitted:  # A second check of an admitted frame would refuse it as a replay.
+            current.is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
+        return current.is_admitted
 
     def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:
         """Return True for frames of a second sender with the same ids, and for outdated heartbeats."""

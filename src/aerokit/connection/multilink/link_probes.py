@@ -75,8 +75,8 @@ class LinkProbes:
         """
         # An unused costly link is probed rarely once it is known whether the link leads to the vehicle.
         is_idle = candidate.is_costly and candidate is not choice.used
-        is_new = not candidate.is_proven and not candidate.is_doubted
-        interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and not is_new else PROBE_INTERVAL_S
+        is_known = candidate.is_same_vehicle is not None
+        interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and is_known else PROBE_INTERVAL_S
         key = system_id, candidate.link
         if now - self._probed_at.get(key, -math.inf) < interval_s - TIMER_TOLERANCE_S:
             return
@@ -153,7 +153,7 @@ class LinkProbes:
     def _report_other_vehicle(self, frame: Frame, candidate: Candidate) -> None:
         """Report once that the link seems to lead to another vehicle with the same system id."""
         key = frame.system_id, candidate.link
-        if not candidate.is_doubted:
+        if candidate.is_same_vehicle is not False:
             self._reported.discard(key)  # If the link leads to another vehicle later, that is reported again.
         elif key not in self._reported:
             self._reported.add(key)

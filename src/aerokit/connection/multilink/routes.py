@@ -159,13 +159,13 @@ class MultiLinkRoutes:
         is_autopilot = getattr(heartbeat, "autopilot", MavAutopilot.INVALID) != MavAutopilot.INVALID
         choice = self._choices.get(frame.system_id)
         if choice is None:
-            choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
+            choice = self._choices[frame.system_id] = LinkChoice(has_autopilot=is_autopilot)
         is_costly = _link_index(peer) in self._link.costly
         candidate = choice.record_heartbeat(_link_index(peer), frame.received_at, is_costly=is_costly)
         candidate.is_stalled = _link_index(peer) in self._stalled
-        is_first_autopilot = is_autopilot and not choice.needs_proof
+        is_first_autopilot = is_autopilot and not choice.has_autopilot
         if is_first_autopilot:  # The links known so far lead to other components of this system.
-            choice.start_with(candidate)
+            choice.record_autopilot(candidate)
         if counters is not None:
             self._counters.setdefault((frame.system_id, _link_index(peer)), {})[frame.component_id] = counters
         if choice.used is None:
@@ -217,8 +217,8 @@ class MultiLinkRoutes:
 
     # -------------------------------------------------------------------- received frames
 
-    def is_copy(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
-        """Return True if this frame was already accepted over another link, or has our own ids.
+    def is_duplicate(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
+        """Return True if this frame was already delivered over another link, or has our own ids.
 
         ``is_other_peer`` is the result of `arrived_on_other_peer`.
         """
@@ -227,7 +227,7 @@ class MultiLinkRoutes:
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link_index(peer)
-        if not self._merged.was_accepted(frame, link, may_prove=not is_other_peer):
+        if not self._merged.is_duplicate(frame, link, is_other_peer=is_other_peer):
             return False
         if is_other_peer:  # A second sender proves nothing, because commands over this link go to the first sender.
             return True
@@ -373,7 +373,7 @@ class MultiLinkRoutes:
         self._states.set_cell(now)
 
     def _probe(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
-        if choice.needs_proof and candidate.is_available and not candidate.is_stalled:
+        if choice.has_autopilot and candidate.is_available and not candidate.is_stalled:
             is_attached = system_id in self._attached
             for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):
                 self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)
