@@ -207,8 +207,8 @@ class FrameReceiver:
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
             if multilink is not None and multilink.is_duplicate(frame, peer, is_other_peer=is_other_peer):
                 continue
-            # With several links, `_is_admitted` is called even if the gate is open, because it records the admission.
-            must_check = multilink is not None or not gate.is_open
+            # With several links, `_is_admitted` is always called, because it records the admission.
+            must_check = multilink is not None or not gate.admits_all
             if must_check and not self._is_admitted(frame, is_other_peer):
                 continue
             # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that
@@ -270,7 +270,7 @@ class FrameReceiver:
         self._bus.one_at_a_time = (
             self._is_closed
             or self._multilink is not None
-            or not self._gate.is_open
+            or not self._gate.admits_all
             or self.observers.want_all
             or len(self.framers) > 1
         )

@@ -43,10 +43,10 @@ class SignatureGate:
         self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # last logged error of writing the file of ``Signing(keep=…)``
         # The owner calls `set_signing`, which sets the actual value, before the first frame.
-        self.is_open: bool = True
-        """True while all frames are admitted without a check."""
+        self.admits_all: bool = True
+        """True while no frame needs a check."""
         self.on_change: Callable[[], object] = lambda: None
-        """Called when :attr:`is_open` may have changed."""
+        """Called when :attr:`admits_all` may have changed."""
 
     def set_signing(self, signing: Signing | None) -> None:
         """Sign and verify with this key from now on (None: neither). Raises InvalidArgument with MAVLink 1."""
@@ -81,7 +81,7 @@ class SignatureGate:
             self._update()
 
     def _update(self) -> None:
-        self.is_open = self._encoder.signing is None and self._handover is None
+        self.admits_all = self._encoder.signing is None and self._handover is None
         self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
