@@ -21,7 +21,7 @@ from aerokit.errors import (
     SetpointStreamStopped,
     ValueUnknownError,
 )
-from aerokit.fleets.action import FleetAction
+from aerokit.fleets.action import ActionKind, FleetAction
 from aerokit.fleets.distances import POSITION_MAX_AGE_S, altitude_amsl, position_of
 from aerokit.fleets.events import FollowingStopped
 from aerokit.fleets.members import Member
@@ -234,7 +234,9 @@ class Following:
             raise BusyError("a Following can be entered only once; call following() again")
         _check_leader(self._leader)
         self._was_entered = True
-        self._action = FleetAction(self._context, "following", self._followers, self._fly_follower, moves_members=True)
+        self._action = FleetAction(
+            self._context, "following", self._followers, self._fly_follower, kind=ActionKind.MOVES
+        )
         self._tasks.start(self._follow, "aerokit following")
         return self
 
