@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack, contextmanager
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
 
@@ -123,13 +123,11 @@ async def fleet(
             passed_count=len(members),
             timeout=timeout,
         )
-        systems: list[tuple[str, Connection, int]] = []
-        for name in searched:
-            systems += [(name, networks[name], system_id) for system_id in ids[name]]
+        systems = [_System(name, networks[name], system_id) for name in searched for system_id in ids[name]]
         connections = MemberConnections(timeout, rates)
         stack.push_async_exit(connections.aclose)
-        for name, vehicle in await connections.open(systems):
-            members.append(Member(f"{name}/{vehicle.system_id}", name, vehicle))
+        for system, vehicle in zip(systems, await connections.open(systems), strict=True):
+            members.append(Member(system.name, system.network, vehicle))
         _check_names(members)
         now = next(iter(networks.values())).now  # the clock of the event loop, which all connections share
         context = FleetContext(members, networks, rules, now=now, on_error=_raise, min_distance_m=min_distance_m)
@@ -326,6 +324,18 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
         timer.cancel()
 
 
+class _System(NamedTuple):
+    """A vehicle to connect to."""
+
+    network: str
+    connection: Connection
+    system_id: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.network}/{self.system_id}"
+
+
 class _BlockFailed(Exception):
     """Raised in each vehicle's block if the fleet's block has failed, so that a vehicle left flying is logged."""
 
@@ -336,7 +346,7 @@ class MemberConnections:
     def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
         self._timeout, self._rates = timeout, rates
         self._tasks = BackgroundTasks(self._on_error)
-        self._connected: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
+        self._connected: dict[_System, Vehicle] = {}
         self._error: Exception | None = None
         self._changed = asyncio.Event()  # set after each connection and each error
         self._close = asyncio.Event()  # set at the end of the fleet's block
@@ -344,19 +354,14 @@ class MemberConnections:
         self._running_task_count = 0
         self._all_closed = asyncio.Event()
 
-    async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
-        """Connect to systems, given as tuples of network, connection and system id.
-
-        Returns the network and the vehicle of each system, in the same order.
-        """
-        for index, (network, connection, system_id) in enumerate(systems):
+    async def open(self, systems: Sequence[_System]) -> list[Vehicle]:
+        """Connect to systems, and return their vehicles in the same order."""
+        for system in systems:
             self._running_task_count += 1
-            self._tasks.start(partial(self._run, index, network, connection, system_id))
+            self._tasks.start(partial(self._run, system))
 
         def describe_missing() -> str:
-            names = [f"{network}/{system_id}" for network, _, system_id in systems]
-            missing = (name for index, name in enumerate(names) if index not in self._connected)
-            return f"no heartbeat of {', '.join(missing)}"
+            return f"no heartbeat of {', '.join(system.name for system in systems if system not in self._connected)}"
 
         with warn_while_waiting(self._timeout, describe_missing):
             while len(self._connected) < len(systems) and self._error is None:
@@ -364,7 +369,7 @@ class MemberConnections:
                 await self._changed.wait()
         if self._error is not None:
             raise self._error
-        return [self._connected[index] for index in range(len(systems))]
+        return [self._connected[system] for system in systems]
 
     async def aclose(
         self,
@@ -383,10 +388,11 @@ class MemberConnections:
     async def _wait_until_all_closed(self) -> None:
         await self._all_closed.wait()
 
-    async def _run(self, index: int, network: str, connection: Connection, system_id: int) -> None:
+    async def _run(self, system: _System) -> None:
+        connection, system_id = system.connection, system.system_id
         try:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
-                self._connected[index] = (network, vehicle)
+                self._connected[system] = vehicle
                 self._changed.set()
                 await self._close.wait()
                 if self._has_block_failed:  # connect() must close the vehicle as after an error in its own block.

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from aerokit.fleets.paths import LocalPoint
     from aerokit.vehicle.vehicle import Vehicle
 
+    TrackSample = tuple[float, LocalPoint]  # seconds since the start of the show, and metres north, east and up
+
 __all__ = [
     "ClockOffset",
     "ShowReport",
@@ -165,8 +167,8 @@ class ShowReport(Snapshot):
     max_relative_error_m: float | None
 
 
-def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
-    """Compare a path with measured positions: ``samples`` has (seconds since the start of the show, position).
+def track_deviation(path: Path, samples: Sequence[TrackSample]) -> TrackDeviation:
+    """Compare a path with measured positions.
 
     The lag is the time by which the path must be delayed to fit the samples best (least squares along the track).
     """
@@ -189,7 +191,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
 
 
 def max_relative_error(
-    paths: Mapping[str, Path], samples: Mapping[str, Sequence[tuple[float, LocalPoint]]], duration_s: float
+    paths: Mapping[str, Path], samples: Mapping[str, Sequence[TrackSample]], duration_s: float
 ) -> float | None:
     """Return the largest difference, in metres, between the planned and the flown vector from one vehicle to another.
 
@@ -216,7 +218,7 @@ def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
     return north, east, up
 
 
-def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
+def _interpolate(samples: Sequence[TrackSample], at_s: float) -> LocalPoint | None:
     """Return the position at a time between two samples; None if there are no such samples."""
     for (start_s, start), (end_s, end) in pairwise(samples):
         if start_s <= at_s <= end_s:
@@ -232,21 +234,18 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 class TrackRecorder:
     """Records a vehicle's track while the recorder's ``with`` block runs, from GLOBAL_POSITION_INT.
 
-    Each sample has the seconds since the start of the show, and metres north, east and up of the show's origin.
-
     Times are ``time_boot_ms``, converted by the clock offset that TIMESYNC has measured. If TIMESYNC turns out to use
     another clock than ``time_boot_ms``, the times at which the messages arrived are used instead.
     """
 
-    def __init__(
-        self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin_at: float, origin_amsl_m: float
-    ) -> None:
-        self._vehicle, self._clock, self._begin_at, self._origin_amsl_m = vehicle, clock, begin_at, origin_amsl_m
-        position = origin.to_position((0.0, 0.0, origin_amsl_m))
+    def __init__(self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin_at: float) -> None:
+        self._vehicle, self._clock, self._begin_at = vehicle, clock, begin_at
+        position = origin.to_position((0.0, 0.0, 0.0))
         self._latitude, self._longitude = position.latitude_deg, position.longitude_deg
+        self._altitude_amsl_m = position.altitude_amsl_m or 0.0
         metres_per_degree = _metres_per_degree(origin, self._latitude, self._longitude)
         self._metres_per_latitude_degree, self._metres_per_longitude_degree = metres_per_degree
-        self.samples: list[tuple[float, LocalPoint]] = []  # seconds since the start of the show, and position
+        self.samples: list[TrackSample] = []
         self._latest: tuple[float, LocalPoint, LocalPoint] | None = None  # time, position and velocity
         self._detach: Detach | None = None
 
@@ -289,7 +288,7 @@ class TrackRecorder:
         place = (
             (latitude - self._latitude) * self._metres_per_latitude_degree,
             math.remainder(longitude - self._longitude, 360.0) * self._metres_per_longitude_degree,
-            message.alt / 1000 - self._origin_amsl_m,
+            message.alt / 1000 - self._altitude_amsl_m,
         )
         self._latest = measured_at, place, (message.vx / 100, message.vy / 100, -message.vz / 100)
         if measured_at >= self._begin_at:
@@ -321,8 +320,7 @@ class Shows(Travel):
             InvalidArgument: the name of a track is not that of a member.
             ValueUnknownError: the position of the first member is unknown.
         """
-        local_origin, origin_amsl_m = self._local_origin(show, origin)
-        return self._start_positions(show, local_origin, origin_amsl_m)
+        return self._start_positions(show, self._local_origin(show, origin))
 
     async def fly_show(
         self,
@@ -363,14 +361,14 @@ class Shows(Travel):
         check_range("rate_hz", rate_hz, 2, 50)
         check_range("start_in_s", start_in_s, 0, 3600)
         check_range("lead_s", lead_s or 0.0, 0, 10)
-        local_origin, origin_amsl_m = self._local_origin(show, origin)
-        self._check_show(show, local_origin, origin_amsl_m)
+        local_origin = self._local_origin(show, origin)
+        self._check_show(show, local_origin)
         names = tuple(show.tracks)
         orders_before = {name: self._context.newest_orders(self.members[name]) for name in names}
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
         self._check_not_ordered_since(orders_before, "fly_show", "the show was not started")
-        start_positions = self._start_positions(show, local_origin, origin_amsl_m)
+        start_positions = self._start_positions(show, local_origin)
         arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         for name in names:
@@ -382,7 +380,7 @@ class Shows(Travel):
         with ExitStack() as stack:
             for name in names:
                 vehicle = self.members[name].vehicle
-                recorder = TrackRecorder(vehicle, clocks[name], local_origin, begin_at, origin_amsl_m)
+                recorder = TrackRecorder(vehicle, clocks[name], local_origin, begin_at)
                 recorders[name] = stack.enter_context(recorder)
 
             async def fly(member: Member) -> None:
@@ -406,37 +404,29 @@ class Shows(Travel):
 
     # --------------------------------------------------------------------------------------- private
 
-    def _local_origin(self, show: Show, origin: Position) -> tuple[LocalOrigin, float]:
-        """Return the origin of the show's metres, and its altitude above sea level."""
+    def _local_origin(self, show: Show, origin: Position) -> LocalOrigin:
         for name in show.tracks:
             if name not in self.members:
                 raise InvalidArgument(f"show: {short_repr(name)} is not a member; members: {', '.join(self.members)}")
         if origin.altitude_amsl_m is not None:
-            return LocalOrigin(origin), origin.altitude_amsl_m
+            return LocalOrigin(origin, origin.altitude_amsl_m)
         first_member = self.members[next(iter(show.tracks))]  # its home defines the altitude
         above_home = origin.replace(altitude_relative_m=origin.altitude_relative_m or 0.0)
-        return LocalOrigin(origin), altitude_amsl(first_member, above_home)
+        return LocalOrigin(origin, altitude_amsl(first_member, above_home))
 
     @staticmethod
-    def _start_positions(show: Show, origin: LocalOrigin, origin_amsl_m: float) -> dict[str, Position]:
-        starts = {name: track.points[0] for name, track in show.tracks.items()}
-        return {
-            name: origin.to_position((start.north_m, start.east_m, start.up_m + origin_amsl_m))
-            for name, start in starts.items()
-        }
+    def _start_positions(show: Show, origin: LocalOrigin) -> dict[str, Position]:
+        return {name: origin.to_position(track.points[0].place) for name, track in show.tracks.items()}
 
-    def _check_show(self, show: Show, origin: LocalOrigin, origin_amsl_m: float) -> None:
+    def _check_show(self, show: Show, origin: LocalOrigin) -> None:
         for name in show.tracks:
             self._check_available(self.members[name], "fly_show", "nothing was sent")
         min_m = self._context.min_distance_m
         if min_m is None:
             return
         stationary = stationary_members(self._context.members, origin, moving=show.tracks)
-        above_origin = {
-            name: (north, east, amsl_m - origin_amsl_m) for name, (north, east, amsl_m) in stationary.items()
-        }
         tracks = [track.replace(name=name) for name, track in show.tracks.items()]
-        paths = [*tracks, *resting_paths(above_origin)]
+        paths = [*tracks, *resting_paths(stationary)]
         conflicts = [
             conflict
             for conflict in find_conflicts(paths, min_m, slack_s=CONFLICT_SLACK_S)
