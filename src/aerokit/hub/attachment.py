@@ -103,8 +103,8 @@ class Attachment:
             totals = totals.plus(framer)
         systems: set[tuple[int, int]] = set()
         for port in ports:
-            if port.node is not None:
-                systems.update(router.senders_at(port.node))
+            if port.ingress is not None:
+                systems.update(router.senders_at(port.ingress))
         dropped = {reason: count for reason, count in self.counters.dropped.items() if count}
         if self.link.dropped_writes:
             dropped["link"] = self.link.dropped_writes

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable, Mapping
 
-    from aerokit.hub.routing import ForwardingPlan, RouterPort
+    from aerokit.hub.routing import ForwardingPlan, Ingress
     from aerokit.hub.senders import IdentityGuard
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.dialect import Dialect
@@ -35,6 +35,13 @@ class QueuedFrame(NamedTuple):
     waiting_since: float  # loop time
 
 
+class DroppedFrame(NamedTuple):
+    """A frame that was removed from a queue. ``reason`` is a key of `EndpointStatistics.dropped`."""
+
+    reason: str
+    frame: QueuedFrame
+
+
 class FrameQueue:
     """Queue in which newer telemetry replaces older telemetry with the same message id and sender.
 
@@ -54,33 +61,30 @@ class FrameQueue:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def put(self, frame: QueuedFrame, key: int) -> list[tuple[str, QueuedFrame]]:
-        """Add a frame. Return the frames that were dropped for it, with the reasons.
-
-        ``key`` identifies the sender and the message.
-        """
-        dropped: list[tuple[str, QueuedFrame]] = []
+    def put(self, frame: QueuedFrame, key: int) -> list[DroppedFrame]:
+        """Add a frame. Return the frames that were dropped for it. ``key`` identifies the sender and the message."""
+        dropped: list[DroppedFrame] = []
         if frame.kind is MessageKind.TELEMETRY:
             replaced = self._frames.get(key)
             if replaced is not None:
                 self._bytes += len(frame.raw) - len(replaced.raw)
                 self._frames[key] = frame
-                return [("superseded", replaced)]
+                return [DroppedFrame("superseded", replaced)]
         else:
             self._last_key -= 1  # The key is unique, so that no other frame replaces this one.
             key = self._last_key
         while self._is_full(len(frame.raw)):
             if not self._telemetry_count:
-                return [*dropped, ("queue_full", frame)]
+                return [*dropped, DroppedFrame("queue_full", frame)]
             oldest_telemetry = next(
                 queued_key for queued_key, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY
             )
-            dropped.append(("queue_full", self._remove(oldest_telemetry)))
+            dropped.append(DroppedFrame("queue_full", self._remove(oldest_telemetry)))
         self._frames[key] = frame
         self._count(frame, 1)
         return dropped
 
-    def expire(self, now: float) -> list[tuple[str, QueuedFrame]]:
+    def expire(self, now: float) -> list[DroppedFrame]:
         """Remove and return the commands that have waited too long."""
         if not self._order_count:
             return []
@@ -89,7 +93,7 @@ class FrameQueue:
             for key, queued in self._frames.items()
             if queued.kind is MessageKind.ORDER and now - queued.waiting_since > ORDER_MAX_AGE_S
         ]
-        return [("late", self._remove(key)) for key in late]
+        return [DroppedFrame("late", self._remove(key)) for key in late]
 
     def pop(self) -> bytes | None:
         """Remove and return the first frame. Call :meth:`expire` before."""
@@ -98,8 +102,8 @@ class FrameQueue:
         first_key = next(iter(self._frames))
         return self._remove(first_key).raw
 
-    def clear(self) -> list[tuple[str, QueuedFrame]]:
-        dropped = [("link_lost", frame) for frame in self._frames.values()]
+    def clear(self) -> list[DroppedFrame]:
+        dropped = [DroppedFrame("link_lost", frame) for frame in self._frames.values()]
         self._frames.clear()
         self._bytes = self._order_count = self._telemetry_count = 0
         return dropped
@@ -136,24 +140,24 @@ class SigningGateway:
 
     ``unix_time`` is in seconds since 1970. MAVLink 1 frames are sent as MAVLink 2, and refused on reception unless
     ``allow_unsigned`` of the `Signing` accepts them. Messages outside the dialect cannot be signed, because their
-    checksum cannot be calculated. ``refused(frame, reason)`` is called for each refused frame.
+    checksum cannot be calculated. ``on_refused(frame, reason)`` is called for each refused frame.
     """
 
     def __init__(
-        self, signing: Signing, crc_extras: Mapping[int, bytes], refused: Callable[[Frame, str], object]
+        self, signing: Signing, crc_extras: Mapping[int, bytes], on_refused: Callable[[Frame, str], object]
     ) -> None:
         self.signing = signing
-        self._extras, self._refused = crc_extras, refused
+        self._extras, self._on_refused = crc_extras, on_refused
 
     def verify(self, frame: Frame, unix_time: float) -> Frame | None:
         """Return a received frame without its signature; None if the frame is refused."""
         try:
             refusal = self.signing.check(frame, unix_time)
         except Exception as error:  # `check` calls the program's function `allow_unsigned`.
-            self._refused(frame, f"allow_unsigned raised {error!r}")
+            self._on_refused(frame, f"allow_unsigned raised {error!r}")
             return None
         if refusal is not None:
-            self._refused(frame, refusal.value)
+            self._on_refused(frame, refusal.value)
             return None
         return self.strip_signature(frame)
 
@@ -235,7 +239,7 @@ class Port:
         """Data to write: each element is one frame, or several frames joined."""
         self.joined_frames: int = 0
         """Number of frames in ``batch`` minus the number of its pieces, for the counters."""
-        self.node: RouterPort[Port] | None = None
+        self.ingress: Ingress[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes = queue_above_bytes
         self._may_queue = queue_above_bytes < UNLIMITED  # False if frames never wait
@@ -309,7 +313,8 @@ class Port:
         self._drop(self._queue.expire(math.inf))
 
     def drop_late(self, frame: Frame, target: tuple[int, int], arrived_at: float) -> None:
-        self._drop([("late", QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, arrived_at))])
+        queued = QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, arrived_at)
+        self._drop([DroppedFrame("late", queued)])
 
     def close(self) -> None:
         self._drop(self._queue.clear())
@@ -326,7 +331,7 @@ class Port:
         self.counters.dropped["unsignable"] += signed.count(None)
         return [raw for raw in signed if raw is not None]
 
-    def _drop(self, dropped: list[tuple[str, QueuedFrame]]) -> None:
+    def _drop(self, dropped: list[DroppedFrame]) -> None:
         for reason, frame in dropped:
             self.counters.dropped[reason] += 1
             self._on_drop(reason, frame)

@@ -76,13 +76,13 @@ class Switch:
         return self._unix_epoch_s + self._clock()
 
     def add(self, port: Port) -> None:
-        port.node = self.router.add(port)
+        port.ingress = self.router.add(port)
 
     def remove(self, port: Port) -> None:
         self._queueing_ports.pop(port, None)
-        node, port.node = port.node, None
-        if node is not None:
-            self.router.remove(node)
+        ingress, port.ingress = port.ingress, None
+        if ingress is not None:
+            self.router.remove(ingress)
         port.close()
 
     def close(self) -> None:
@@ -119,8 +119,8 @@ class Switch:
         ``data`` is the received bytes. It is None if some of the bytes do not belong to the frames.
         """
         # Hot path: local variables are faster than attributes.
-        node, guard, peer = port.node, port.guard, port.peer
-        if node is None or port.is_read_only:  # `node` is None if the port was removed.
+        ingress, guard, peer = port.ingress, port.guard, port.peer
+        if ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
             if guard is not None:  # The guard still records the ids that each peer uses.
                 for frame in frames:
                     guard.admits(frame, framer, peer)
@@ -138,7 +138,7 @@ class Switch:
         if now - arrived_at > ORDER_MAX_AGE_S:
             frames = self._without_commands(port, frames, arrived_at)
             data = None
-        plans = self.router.route_all(node, frames, arrived_at, late)
+        plans = self.router.route_all(ingress, frames, arrived_at, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
@@ -223,7 +223,7 @@ class Switch:
             self.recording.write(raw, now)
 
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        if out.node is None:
+        if out.ingress is None:
             return  # The port was removed after the frame was routed.
         if out.must_queue():
             out.enqueue(raw, plan, now)
