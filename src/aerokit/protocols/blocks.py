@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from aerokit.protocols.request_window import LOSS_THRESHOLD
+
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
-
-# Answers arrive in the order of the requests. When a request is answered, all unanswered requests that were sent at
-# least this many transmissions before it count as lost.
-OVERTAKEN = 3
 
 # Number of requests that are sent at once. ArduPilot queues at most five, processes one every 2 ms, and drops the rest.
 BATCH_SIZE = 4
@@ -154,7 +152,7 @@ class BlockRequests:
         self._round_trip.add_sample(now - sent_at)
         self.window.on_answer(now - sent_at)
         if block.attempts == 1:
-            self._requeue_overtaken(block.transmission_number)
+            self._requeue_lost(block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
         """Return when the answered transmission was sent, or None if it is unknown which one was answered."""
@@ -201,13 +199,13 @@ class BlockRequests:
         block.sent_at = now
         self._in_flight[offset] = block
 
-    def _requeue_overtaken(self, number: int) -> None:
-        overtaken = []
+    def _requeue_lost(self, number: int) -> None:
+        lost = []
         for offset, block in self._in_flight.items():
-            if block.transmission_number > number - OVERTAKEN:
+            if block.transmission_number > number - LOSS_THRESHOLD:
                 break
-            overtaken.append(offset)
-        self._requeue(overtaken)
+            lost.append(offset)
+        self._requeue(lost)
 
     def _requeue(self, offsets: list[int]) -> None:
         for offset in offsets:

@@ -25,8 +25,8 @@ FEW_LEFT_TIMEOUT_S = 0.5
 # Maximum time-out, even if answers have taken longer so far: the queue that delayed them may be empty by then.
 MAX_TIMEOUT_S = 2.0
 # Answers arrive in the order of the requests. When a request is answered, all unanswered requests that were sent at
-# least this many transmissions before it count as lost.
-OVERTAKEN = 3
+# least this many transmissions before it count as lost (like the packet threshold of QUIC, RFC 9002).
+LOSS_THRESHOLD = 3
 
 
 class _Request:
@@ -101,10 +101,10 @@ class RequestWindow(Generic[KeyT]):
         self._in_flight.pop(key, None)
         self._requests.pop(key, None)
 
-    def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
+    def on_answer(self, key: KeyT, now: float, *, loss_threshold: int = LOSS_THRESHOLD) -> list[KeyT]:
         """Record an answer. Requeue the requests that are presumed lost, and return them.
 
-        A request is presumed lost if it was last sent at least ``overtaken`` transmissions before the answered one.
+        Lost are requests that were last sent at least ``loss_threshold`` transmissions before the answered one.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
@@ -121,7 +121,7 @@ class RequestWindow(Generic[KeyT]):
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
             # The answer may belong to the first transmission, so only requests sent before that one count as lost.
-            if request_in_flight.last_number > request.first_number - overtaken:
+            if request_in_flight.last_number > request.first_number - loss_threshold:
                 break  # All further requests were sent later.
             lost.append(key_in_flight)
         self._requeue(lost)
