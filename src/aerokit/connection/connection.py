@@ -129,7 +129,7 @@ class Connection:
         self.keeps_peers = True  # read by the link; see `aerokit.transport.link.PeerKeeper`
         self._background = BackgroundTasks(self.fail)
         self._owns_link = True  # False if the link turns out to belong to another connection
-        self._state_watch = LinkStateTracker(self.link_state, self.bus, system_id=0)
+        self._state_tracker = LinkStateTracker(self.link_state, self.bus, system_id=0)
         self._end_signal = EndSignal()
         # None if this program sends no heartbeat.
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
@@ -454,13 +454,13 @@ class Connection:
 
     def link_interrupted(self, error: LinkLost) -> None:
         """Called when the link was lost and is being reopened."""
-        self._state_watch.mark_lost(self._clock())
+        self._state_tracker.mark_lost(self._clock())
         self.bus.publish(LinkInterrupted(self._clock(), system_id=0, error=error))
 
     def link_restored(self, away_s: float) -> None:
         """Called when the link is open again after an interruption."""
         self._receiver.reset()
-        self._state_watch.record_activity(self._clock())
+        self._state_tracker.record_activity(self._clock())
         self.bus.publish(LinkRestored(self._clock(), system_id=0, away_s=away_s))
 
     def link_stalled(self, unsent_bytes: int) -> None:
@@ -512,7 +512,7 @@ class Connection:
 
     def _start(self) -> None:
         """Start the tasks that run until the connection ends."""
-        self._state_watch.record_activity(self._clock())
+        self._state_tracker.record_activity(self._clock())
         self._receiver.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
         if self._multilink is not None:
@@ -523,7 +523,7 @@ class Connection:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
             self._gate.log_storage_errors()
-            self._state_watch.update(self._clock(), sum(counters.frames for counters in self.statistics()))
+            self._state_tracker.update(self._clock(), sum(counters.frames for counters in self.statistics()))
             self._observers.flush()
             await anyio.sleep(HEARTBEAT_INTERVAL_S)
 
@@ -535,7 +535,7 @@ class Connection:
         self._receiver.close()
         self._observers.flush()  # The task that flushes regularly ends below, and the program may run on for hours.
         # Only a lost link is published as an event: a program that closes the connection itself needs none.
-        self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
+        self._state_tracker.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
         if self._multilink is not None:
             self._multilink.status.close(error)

@@ -64,7 +64,7 @@ class Copies:
     """
 
     def __init__(self) -> None:
-        # (body, checksum, signature) → what is known about the frame.
+        # The key has body, checksum and signature of the frame.
         self._seen: dict[tuple[bytes, int, bytes], ReceivedFrame] = {}
         self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
         self.current: ReceivedFrame = ReceivedFrame(-math.inf, 0)

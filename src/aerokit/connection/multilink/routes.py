@@ -153,21 +153,21 @@ class MultiLinkRoutes:
 
         Returns False if the routing table is full, or if the system id is 0.
         """
-        if not frame.system_id or not self._routes[_link_index(peer)].record_heartbeat(frame, peer, counters):
+        link = _link_index(peer)
+        if not frame.system_id or not self._routes[link].record_heartbeat(frame, peer, counters):
             return False
         heartbeat = self._bus.dialect.decode(frame)
         is_autopilot = getattr(heartbeat, "autopilot", MavAutopilot.INVALID) != MavAutopilot.INVALID
         choice = self._choices.get(frame.system_id)
         if choice is None:
             choice = self._choices[frame.system_id] = LinkChoice(has_autopilot=is_autopilot)
-        is_costly = _link_index(peer) in self._link.costly
-        candidate = choice.record_heartbeat(_link_index(peer), frame.received_at, is_costly=is_costly)
-        candidate.is_stalled = _link_index(peer) in self._stalled
+        candidate = choice.record_heartbeat(link, frame.received_at, is_costly=link in self._link.costly)
+        candidate.is_stalled = link in self._stalled
         is_first_autopilot = is_autopilot and not choice.has_autopilot
         if is_first_autopilot:  # The links known so far lead to other components of this system.
             choice.record_autopilot(candidate)
         if counters is not None:
-            self._counters.setdefault((frame.system_id, _link_index(peer)), {})[frame.component_id] = counters
+            self._counters.setdefault((frame.system_id, link), {})[frame.component_id] = counters
         if choice.used is None:
             self._choose(frame.system_id, choice, frame.received_at)
         return True
