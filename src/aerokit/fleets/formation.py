@@ -27,7 +27,7 @@ from aerokit.fleets.events import FollowingStopped
 from aerokit.fleets.members import Member
 from aerokit.fleets.policy import FleetResult
 from aerokit.fleets.separation import to_local_points
-from aerokit.fleets.travel import Travel
+from aerokit.fleets.travel import FlightOptions, Travel
 from aerokit.position import Position
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
@@ -388,7 +388,7 @@ class Formations(Travel):
             targets[follower.name] = target
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        return await self._travel("form", targets, speed_m_s, timeout)
+        return await self._travel("form", targets, FlightOptions(speed_m_s, timeout))
 
     def following(
         self, formation: Formation, *, leader: str, rate_hz: float = 5.0, max_speed_m_s: float = 10.0
