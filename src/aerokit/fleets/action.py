@@ -131,7 +131,7 @@ class FleetAction:
         self._policy_order_errors: dict[str, str] = {}
         self._pending_policy_orders = 0  # number of policy orders that have not ended
         self._last_start_at = -math.inf  # when the last member started
-        self._undecided: list[tuple[Member, Exception]] = []  # failures about which the policy is still to be asked
+        self._undecided: list[Member] = []  # failed members about which the policy is still to be asked
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
@@ -321,24 +321,25 @@ class FleetAction:
         # The program flies a released member separately, so its failure does not concern the others.
         if self._ends_flight or self._context.is_closed or member.state is MemberState.RELEASED:
             return
-        self._undecided.append((member, error))
+        self._undecided.append(member)
         # `_apply_policy` refreshes the other members, which can call this method again. The outer call then handles
         # the new failure.
         if len(self._undecided) > 1:
             return
         while self._undecided:
             if self._policy_cause is None:  # The policy has not given orders in this action yet.
-                self._apply_policy(*self._undecided[0])
+                self._apply_policy(self._undecided[0])
             del self._undecided[0]
 
     # ------------------------------------------------------------------------------ other members
 
-    def _apply_policy(self, failed: Member, error: Exception) -> None:
+    def _apply_policy(self, failed: Member) -> None:
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
         available = [member for member in others if member.is_available]
-        failure = MemberFailure(failed.name, failed.group, self.name, error, tuple(member.name for member in available))
+        error, names = self._failed[failed.name], tuple(member.name for member in available)
+        failure = MemberFailure(failed.name, failed.group, self.name, error, others=names)
         orders = self._decide(failure)
         if not orders:
             return

@@ -6,7 +6,7 @@ Points are in metres north, east and up of a common origin. Times are in seconds
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -228,7 +228,7 @@ def _closest_inside(
     return (s, t) if 0 <= s <= 1 and 0 <= t <= 1 else None
 
 
-def _clip(corners: list[tuple[float, float]], outside: _Outside) -> list[tuple[float, float]]:
+def _clip(corners: list[tuple[float, float]], outside: Callable[[float, float], float]) -> list[tuple[float, float]]:
     """Return the part of a convex polygon where ``outside`` is not positive (Sutherland-Hodgman)."""
     clipped: list[tuple[float, float]] = []
     for index, corner in enumerate(corners):
@@ -269,9 +269,3 @@ def _difference(point: Sequence[float], other: Sequence[float]) -> list[float]:
 
 def _dot(vector: Sequence[float], other: Sequence[float]) -> float:
     return vector[0] * other[0] + vector[1] * other[1] + vector[2] * other[2]
-
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    _Outside = Callable[[float, float], float]  # a function of s and t that is positive outside of the border

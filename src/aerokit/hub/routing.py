@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from aerokit.hub.message_rules import TargetFields
+    from aerokit.hub.senders import FrameRecord
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.frame import Frame
 
@@ -291,7 +292,7 @@ class Router(Generic[PortT]):
         if sender.is_autopilot and sender.port_number != former_number:
             self._report("route_changed", sender.source, ingress, former_number)
 
-    def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
+    def _is_copy(self, earlier: FrameRecord, number: int, now: float, is_late: bool) -> bool:
         """Return True if a frame that equals an earlier frame is a copy of it."""
         # A restarted program numbers its frames from the start again, so its first command may equal an earlier frame.
         # A frame that was received at the same port and in sequence is therefore no copy.
@@ -301,7 +302,7 @@ class Router(Generic[PortT]):
         existed_then = number <= port_count  # This port already existed when the earlier frame arrived.
         return first_port in self._ingresses and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
-    def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
+    def _is_echo(self, earlier: FrameRecord, number: int, now: float) -> bool:
         """Return True if an equal frame arrived at another port recently, while port ``number`` already existed."""
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S

@@ -121,16 +121,19 @@ class Sender:
         return not self.ports
 
 
+FrameRecord = tuple[int, int, float]
+"""Number of the port at which a frame arrived, number of ports created until then, and the time."""
+
+
 class RecentFrames:
     """Recent frames in two tables. Each `LOOP_WINDOW_S`, the older one is dropped as a whole, without a search."""
 
     __slots__ = ("newer", "older", "rotate_at")
 
     def __init__(self) -> None:
-        # Maps sender, sequence number and checksum (as one number) to a record of the frame: the number of the port at
-        # which it arrived, the number of ports created until then, and the time.
-        self.newer: dict[int, tuple[int, int, float]] = {}
-        self.older: dict[int, tuple[int, int, float]] = {}
+        # The keys are sender, sequence number and checksum as one number.
+        self.newer: dict[int, FrameRecord] = {}
+        self.older: dict[int, FrameRecord] = {}
         self.rotate_at: float = -math.inf
         """Time at which to call :meth:`rotate`."""
 

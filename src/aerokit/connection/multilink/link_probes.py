@@ -54,8 +54,8 @@ class LinkProbes:
         self._names, self._choices, self._bus, self._send = names, choices, bus, send
         self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 of a probe → system id, link, send time
         self._probed_at: dict[tuple[int, int], float] = {}  # (system id, link) → time of its last probe
-        # Number of probes that may be sent now to systems without a vehicle object, and the time of its last refill.
-        self._budget, self._budget_at = UNATTACHED_RATE_HZ, 0.0
+        # Token bucket that limits the probes to systems without a vehicle object.
+        self._tokens, self._refilled_at = UNATTACHED_RATE_HZ, 0.0
         self._reported: set[tuple[int, int]] = set()  # (system id, link) of the reported second vehicles
         bus.require_frames(m.Timesync, m.AutopilotVersion)
 
@@ -80,7 +80,7 @@ class LinkProbes:
         key = system_id, candidate.link
         if now - self._probed_at.get(key, -math.inf) < interval_s - TIMER_TOLERANCE_S:
             return
-        if not is_attached and not self._consume_budget(now):
+        if not is_attached and not self._take_token(now):
             return
         self._probed_at[key] = now
         # The answer repeats `ts1`, which identifies the probe: our time in nanoseconds. The last three digits depend on
@@ -133,13 +133,12 @@ class LinkProbes:
             for candidate in choice.candidates.values():
                 self._report_other_vehicle(frame, candidate)
 
-    def _consume_budget(self, now: float) -> bool:
-        """Return True if one more system without a vehicle object may be probed now; their common rate is limited."""
-        self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
-        self._budget_at = now
-        if self._budget < 1:
+    def _take_token(self, now: float) -> bool:
+        self._tokens = min(UNATTACHED_RATE_HZ, self._tokens + UNATTACHED_RATE_HZ * (now - self._refilled_at))
+        self._refilled_at = now
+        if self._tokens < 1:
             return False
-        self._budget -= 1
+        self._tokens -= 1
         return True
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
