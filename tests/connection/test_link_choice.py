@@ -210,7 +210,7 @@ def test_one_copy_of_each_frame_is_accepted(rest: list[tuple[int, float]], seque
         if link in observed:
             continue  # the same link again: another frame
         observed.add(link)
-        if not copies.is_copy(frame_of(sequence, 10.0 + delay), link):
+        if not copies.record(frame_of(sequence, 10.0 + delay), link):
             taken += 1
             copies.current.is_delivered = True
         else:
@@ -220,17 +220,17 @@ def test_one_copy_of_each_frame_is_accepted(rest: list[tuple[int, float]], seque
 
 def test_equal_bytes_same_link_or_later_are_not_copies() -> None:
     copies = Copies()
-    assert not copies.is_copy(frame_of(7, 0.0), 0)
-    assert not copies.is_copy(frame_of(7, 0.1), 0)
-    assert copies.is_copy(frame_of(7, 0.2), 1)
-    assert not copies.is_copy(frame_of(7, 4.0), 1)
+    assert not copies.record(frame_of(7, 0.0), 0)
+    assert not copies.record(frame_of(7, 0.1), 0)
+    assert copies.record(frame_of(7, 0.2), 1)
+    assert not copies.record(frame_of(7, 4.0), 1)
     for number in range(130):
-        assert not copies.is_copy(frame_of((8 + number) % 256, 4.1, number + 1), 0)
-    assert not copies.is_copy(frame_of(7, 4.2), 0), "its sequence numbers have wrapped around"
+        assert not copies.record(frame_of((8 + number) % 256, 4.1, number + 1), 0)
+    assert not copies.record(frame_of(7, 4.2), 0), "its sequence numbers have wrapped around"
 
 
 def test_copies_are_bounded() -> None:
     copies = Copies()
     for number in range(20_000):
-        copies.is_copy(frame_of(number % 256, 0.0, number), 0)
+        copies.record(frame_of(number % 256, 0.0, number), 0)
     assert len(copies._seen) <= 4096

@@ -270,7 +270,7 @@ class Port:
             kind = kind_of(message_type.NAME, has_target=system_id != 0)
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
-    def is_due(self, key: int, period_s: float, now: float) -> bool:
+    def passes_rate_limit(self, key: int, period_s: float, now: float) -> bool:
         """Return True if the rate limit allows a frame now. Otherwise count it as dropped.
 
         ``key`` identifies the sender and the message.

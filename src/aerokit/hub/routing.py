@@ -225,14 +225,14 @@ class Router(Generic[PortT]):
         if earlier is None:
             recent.newer[identity] = number, self._port_count, now
             if ingress.echoes:
-                self._record_new(ingress, source)
+                self._record_new_frame(ingress, source)
         elif self._is_copy(earlier, number, now, is_late):
             return self._duplicate
         elif self._is_echo(earlier, number, now):
             first_port, port_count, _ = earlier
             # Too late for a copy: the frame returns in a slow loop, or equals an earlier one by chance, like the first
             # command of a restarted program. It is forwarded until several frames prove a loop.
-            if self._is_loop(ingress, source, first_port, now):
+            if self._record_echo(ingress, source, first_port, now):
                 return self._loop
             recent.newer[identity] = first_port, port_count, now
         else:
@@ -307,7 +307,7 @@ class Router(Generic[PortT]):
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
 
-    def _is_loop(self, ingress: Ingress[PortT], source: int, first_port: int, now: float) -> bool:
+    def _record_echo(self, ingress: Ingress[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True while a loop is proven."""
         count = min(ingress.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
         ingress.echoes[source] = count
@@ -319,7 +319,7 @@ class Router(Generic[PortT]):
         ingress.loop_until = now + LOOP_WINDOW_S
         return True
 
-    def _record_new(self, ingress: Ingress[PortT], source: int) -> None:
+    def _record_new_frame(self, ingress: Ingress[PortT], source: int) -> None:
         # A new frame is no echo.
         count = ingress.echoes.pop(source, 0) - 1
         if count > 0:

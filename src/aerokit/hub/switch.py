@@ -238,7 +238,7 @@ class Switch:
 
     def _forward_limited(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         for out, period_s in plan.rate_limited:
-            if out.is_due(plan.key, period_s, now):
+            if out.passes_rate_limit(plan.key, period_s, now):
                 if out.batch:
                     out.batch.append(raw)
                 else:

@@ -68,12 +68,12 @@ class Copies:
         self._seen: dict[tuple[bytes, int, bytes], ReceivedFrame] = {}
         self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
         self.current: ReceivedFrame = ReceivedFrame(-math.inf, 0)
-        """Record of the last frame that was passed to :meth:`is_copy`."""
+        """Record of the last frame that was passed to :meth:`record`."""
         self.may_be_late_copy: bool = False
         """True if this frame may be a copy of one that was delivered over another link some seconds ago."""
 
-    def is_copy(self, frame: Frame, link: int, *, is_other_peer: bool = False) -> bool:
-        """Remember a frame. Return True if an equal frame arrived recently, but only over other links.
+    def record(self, frame: Frame, link: int, *, is_other_peer: bool = False) -> bool:
+        """Record a frame. Return True if it is a copy: an equal frame arrived recently, but only over other links.
 
         ``is_other_peer`` is True if a second sender with the same ids sent the frame.
         """
@@ -139,7 +139,7 @@ class _Stream:
         """Return True if a frame with a newer sequence number was already accepted."""
         return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
 
-    def is_repeated(self, payload: bytes, link: int) -> bool:
+    def count_acknowledgement(self, payload: bytes, link: int) -> bool:
         """Count an acknowledgement. Return True if another link delivered it at least as often as this link."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
@@ -164,7 +164,7 @@ class MergedStreams:
 
     def is_duplicate(self, frame: Frame, link: int, *, is_other_peer: bool) -> bool:
         """Return True if this frame is a copy of a frame that was delivered over another link."""
-        if not self.copies.is_copy(frame, link, is_other_peer=is_other_peer):
+        if not self.copies.record(frame, link, is_other_peer=is_other_peer):
             return False
         choice = self._choices.get(frame.system_id)
         # Equal frames with a time since boot prove that their links lead to one vehicle. Other frames, such as
@@ -210,8 +210,7 @@ class MergedStreams:
             return False
         is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
         if is_after_change and frame.message_id in ACKNOWLEDGEMENTS:
-            # `is_repeated` also counts the acknowledgement, so it is called for the link in use, too.
-            is_repeated = stream.is_repeated(frame.payload, link)
+            is_repeated = stream.count_acknowledgement(frame.payload, link)  # counts those of the link in use, too
             if is_repeated and link != choice.used.link:
                 return False
         # A late answer over an unused link must not lower `newest_sequence`, or older telemetry would be accepted. The

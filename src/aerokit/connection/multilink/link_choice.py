@@ -114,16 +114,14 @@ class Candidate:
         self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
 
-    def should_request_hardware(self) -> bool:
-        """Return True if the hardware id is to be requested over this link, and count the request."""
-        if (
-            self.hardware is not None
-            or self.answered_at == -math.inf
-            or self._hardware_requests >= MAX_HARDWARE_REQUESTS
-        ):
-            return False
+    @property
+    def needs_hardware(self) -> bool:
+        """True if the hardware id is unknown, and further requests over this link may be answered."""
+        is_answering = self.answered_at > -math.inf
+        return self.hardware is None and is_answering and self._hardware_requests < MAX_HARDWARE_REQUESTS
+
+    def count_hardware_request(self) -> None:
         self._hardware_requests += 1
-        return True
 
     @property
     def is_hardware_pending(self) -> bool:
@@ -238,26 +236,28 @@ class LinkChoice:
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
-            if not self.clock.add(at, vehicle_s, round_trip_s):
-                # The clock jumped, so the vehicle has rebooted or was replaced by another vehicle. The next hardware id
-                # over this link is therefore accepted as the vehicle's id.
-                self._hardware_link = link
-                for affected in self.candidates.values():
-                    affected.on_reboot()
-            elif not self.clock.is_steady:
-                # The clock was paused for a moment, so earlier mismatches of other links prove nothing.
-                for affected in self.candidates.values():
-                    affected.reset_mismatches()
-        else:
-            candidate.count_answer()
-            matches = self.clock.matches(at, vehicle_s, round_trip_s)
-            if not matches and is_used_silent:
-                # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove
-                # another vehicle. Only a matching hardware id counts as a match; otherwise the answer is ignored
-                # (None).
-                matches = True if self._is_confirmed_by_hardware(candidate, now) else None
-            if matches is not None:
-                candidate.record_clock(matches, awaits_hardware=self._awaits_hardware(candidate))
+            self._update_clock(link, at, vehicle_s, round_trip_s)
+            return
+        candidate.count_answer()
+        matches = self.clock.matches(at, vehicle_s, round_trip_s)
+        if not matches and is_used_silent:
+            # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove that
+            # this is another vehicle. Only a matching hardware id counts; otherwise the answer is ignored (None).
+            matches = True if self._is_confirmed_by_hardware(candidate, now) else None
+        if matches is not None:
+            candidate.record_clock(matches, awaits_hardware=self._awaits_hardware(candidate))
+
+    def _update_clock(self, link: int, at: float, vehicle_s: float, round_trip_s: float) -> None:
+        if not self.clock.add(at, vehicle_s, round_trip_s):
+            # The clock jumped, so the vehicle has rebooted or was replaced by another vehicle. The next hardware id
+            # over this link is therefore accepted as the vehicle's id.
+            self._hardware_link = link
+            for candidate in self.candidates.values():
+                candidate.on_reboot()
+        elif not self.clock.is_steady:
+            # The clock was paused for a moment, so earlier mismatches of other links prove nothing.
+            for candidate in self.candidates.values():
+                candidate.reset_mismatches()
 
     def record_hardware(self, link: int, hardware: HardwareId) -> None:
         candidate = self.candidates[link]
@@ -304,12 +304,11 @@ class LinkChoice:
         self._command_at = now
 
     def should_request_hardware(self, candidate: Candidate, *, is_attached: bool) -> bool:
-        """Return True if the hardware id is to be requested over this link, and count the request."""
         if candidate is not self.used:
-            return not candidate.is_same_vehicle and candidate.should_request_hardware()
+            return candidate.needs_hardware and not candidate.is_same_vehicle
         # Over the link in use, an attached vehicle object requests the id itself.
         has_other_links = len(self.candidates) > 1  # With a single link, there is no other id to compare with.
-        return has_other_links and not is_attached and candidate.should_request_hardware()
+        return candidate.needs_hardware and has_other_links and not is_attached
 
     def _is_confirmed_by_hardware(self, candidate: Candidate, now: float) -> bool:
         is_same = (

@@ -96,17 +96,15 @@ class LinkProbes:
         # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm, because actions use
         # other commands, and `request_message` waits for the message itself.
         if choice.should_request_hardware(candidate, is_attached=is_attached):
+            candidate.count_hardware_request()
             request = m.CommandLong(
                 system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
                 param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
             )  # fmt: skip
             self._send(request, peer)
 
-    def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes over any link.
-
-        The call records the answer if the autopilot sent it over the link of the probe.
-        """
+    def record_answer(self, frame: Frame, link: int) -> bool:
+        """Record the autopilot's answer to a probe over this link. Return True if the TIMESYNC answers any probe."""
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
         if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:

@@ -241,7 +241,7 @@ class MultiLinkRoutes:
     def accepts(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
         """Return True if the frame is to be delivered. Heartbeats are recorded in any case."""
         link = _link_index(peer)
-        if frame.message_id == m.Timesync.ID and self._probes.is_answer(frame, link):
+        if frame.message_id == m.Timesync.ID and self._probes.record_answer(frame, link):
             return False
         self._probes.record_hardware(frame, link)
         if frame.message_id == m.Heartbeat.ID:
