@@ -151,7 +151,7 @@ class FrameReceiver:
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
         self._is_closed = False  # True once the connection has ended; frames are then dropped
-        bus.one_at_a_time = multilink is not None  # Frames of several links are checked one by one.
+        bus.must_check_frames = multilink is not None
         gate.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
 
@@ -184,14 +184,14 @@ class FrameReceiver:
             self._update_checks()
         if not frames:
             return
-        if self._bus.one_at_a_time or framer.late or framer.foreign:
+        if self._bus.must_check_frames or framer.late or framer.foreign:
             self._check_and_deliver(frames, framer, peer)
             return
         # Frames that need no checks are delivered together.
         last_delivered = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
         if last_delivered is not None:
-            # The delivery stopped after this frame, because one of its sinks closed the connection, set a signing key
-            # or added an observer. The other frames now need checks. This frame was not yet passed to the observers.
+            # One of the sinks of this frame closed the connection, set a signing key or added an observer. The other
+            # frames now need checks. This frame was not yet passed to the observers.
             self.observers.notify_received(last_delivered, peer)
             # Frames are compared by identity, so that an equal frame earlier in the list is not taken for this one.
             remaining = frames[frames.index(last_delivered) + 1 :]
@@ -267,7 +267,7 @@ class FrameReceiver:
         self._routes.exclude_pause(self._clock(), paused_s)
 
     def _update_checks(self) -> None:
-        self._bus.one_at_a_time = (
+        self._bus.must_check_frames = (
             self._is_closed
             or self._multilink is not None
             or not self._gate.admits_all

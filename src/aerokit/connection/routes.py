@@ -255,7 +255,9 @@ class Routes:
             if system_id in self._attached or now - route.heartbeat_at <= PEER_TTL_S
         }
         evicted = next((peer for peer in peers if peer not in live), None)
-        self._other_peers = {key: other for key, other in self._other_peers.items() if key[1] != evicted}
+        self._other_peers = {
+            (source, peer): other for (source, peer), other in self._other_peers.items() if peer != evicted
+        }
         return evicted
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
@@ -307,7 +309,9 @@ class Routes:
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
         # The others were compared with the old owner.
-        self._other_peers = {key: other for key, other in self._other_peers.items() if key[0] != source}
+        self._other_peers = {
+            (component, peer): other for (component, peer), other in self._other_peers.items() if component != source
+        }
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, other: OtherPeer, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
