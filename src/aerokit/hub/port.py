@@ -237,8 +237,6 @@ class Port:
         """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
         """Data to write: each element is one frame, or several frames joined."""
-        self.joined_frames: int = 0
-        """Number of frames in ``batch`` minus the number of its pieces, for the counters."""
         self.ingress: Ingress[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes = queue_above_bytes
@@ -294,8 +292,7 @@ class Port:
         if self.gateway is not None:
             batch = self._signed(batch, unix_time)
         counters, write, peer = self.counters, self.link.write, self.peer
-        counters.frames_out += len(batch) + self.joined_frames
-        self.joined_frames = 0
+        counters.frames_out += len(batch)  # `Switch` has counted the further frames of joined pieces.
         is_joined = len(batch) > 1 and not self.writes_single_frames
         for piece in joined(batch) if is_joined else batch:
             counters.bytes_out += len(piece)
@@ -319,7 +316,6 @@ class Port:
     def close(self) -> None:
         self._drop(self._queue.clear())
         self.batch.clear()
-        self.joined_frames = 0
         self._due.clear()
 
     def _is_full(self) -> bool:

@@ -206,7 +206,7 @@ class Switch:
             if not out.batch:
                 self._ports_to_flush.append(out)
             out.batch.append(data)
-            out.joined_frames += len(plans) - 1
+            out.counters.frames_out += len(plans) - 1  # `flush` counts each piece of the batch as one frame.
         return True
 
     def _forward(self, port: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
