@@ -29,7 +29,7 @@ from aerokit.fleets.policy import FleetResult, MemberFailure
 from aerokit.vehicle.commanding.arbiter import STEERING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.connection.connection import Connection
     from aerokit.fleets.events import FleetEvent
@@ -346,18 +346,12 @@ class FleetAction:
         self._policy_cause = failed
         self._cancel_tasks_of([failed])
         skipped = {member.name: member.reason for member in others if not member.is_available}
-        for member in available:
-            order = orders.get(member.name)
-            if order is None:
-                continue
-            if self._has_newer_order(member):
-                skipped[member.name] = "it has a newer order"
-            elif member.is_flown_by_program:
-                self._policy_orders[member.name] = order
-            elif member.vehicle.is_confirmed_disarmed:
-                skipped[member.name] = "it is disarmed"
+        stopping = [member for member in available if member.name in orders]
+        for member in stopping:
+            if reason := self._reason_to_skip(member):
+                skipped[member.name] = reason
             else:
-                skipped[member.name] = "this program does not fly it"
+                self._policy_orders[member.name] = orders[member.name]
             has_finished = member.name in self._outcomes
             # If a member has finished the action and gets no order, its outcome stays.
             if member.name in self._policy_orders or not has_finished:
@@ -366,20 +360,30 @@ class FleetAction:
         self._context.publish(
             PolicyApplied(now, system_id, failed.name, action=self.name, orders=self.policy_orders, skipped=skipped)
         )
-        self._pending_policy_orders = len(self._policy_orders)
-        for member in available:
-            if member.name in self._policy_orders:
-                task = self._context.background.start(
-                    partial(self._send_order, member, self._policy_orders[member.name]), f"aerokit policy {member.name}"
-                )
-                if task is not None:  # The callback runs even if the task is cancelled before it begins.
-                    task.add_done_callback(partial(self._on_order_end, member.name))
+        self._send_policy_orders([member for member in stopping if member.name in self._policy_orders])
         # The running actions are cancelled one loop iteration later. By then, the policy's orders have superseded those
         # of the actions, so that the cancelled actions do not send a hold.
-        stopping = [member for member in available if member.name in orders]
         asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
         if not self._policy_orders:
             self._publish_completed()
+
+    def _reason_to_skip(self, member: Member) -> str:
+        """Return why the policy must not send the member an order; an empty string if it may."""
+        if self._has_newer_order(member):
+            return "it has a newer order"
+        if member.is_flown_by_program:
+            return ""
+        return "it is disarmed" if member.vehicle.is_confirmed_disarmed else "this program does not fly it"
+
+    def _send_policy_orders(self, members: Sequence[Member]) -> None:
+        self._pending_policy_orders = len(members)
+        for member in members:
+            order = self._policy_orders[member.name]
+            task = self._context.background.start(
+                partial(self._send_order, member, order), f"aerokit policy {member.name}"
+            )
+            if task is not None:  # The callback runs even if the task is cancelled before it begins.
+                task.add_done_callback(partial(self._on_order_end, member.name))
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
         try:
