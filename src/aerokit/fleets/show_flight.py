@@ -390,17 +390,7 @@ class Shows(Travel):
                 )
 
             result = await self._run("show", fly, names=names)
-        samples = {name: recorder.samples for name, recorder in recorders.items()}
-        tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
-        lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
-        offsets = {name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)}
-        return ShowReport(
-            result=result,
-            tracks=tracks,
-            clocks=offsets,
-            lag_spread_s=max(lags) - min(lags) if lags else None,
-            max_relative_error_m=max_relative_error(show.tracks, samples, show.duration_s),
-        )
+        return _report(show, result, clocks, {name: recorder.samples for name, recorder in recorders.items()})
 
     # --------------------------------------------------------------------------------------- private
 
@@ -439,6 +429,20 @@ class Shows(Travel):
                 f"fly_show: {conflict.name} and {conflict.other} come within {conflict.distance_m:.1f} m of each"
                 f" other{more}, closer than the minimum of {min_m:g} m; nothing was sent"
             )
+
+
+def _report(
+    show: Show, result: FleetResult, clocks: FleetResult, samples: Mapping[str, Sequence[TrackSample]]
+) -> ShowReport:
+    tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
+    lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
+    return ShowReport(
+        result=result,
+        tracks=tracks,
+        clocks={name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)},
+        lag_spread_s=max(lags) - min(lags) if lags else None,
+        max_relative_error_m=max_relative_error(show.tracks, samples, show.duration_s),
+    )
 
 
 async def _fly_track(

@@ -92,16 +92,9 @@ class LinkProbes:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = system_id, candidate.link, now
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
-        # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack). The ack of this
-        # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm, because actions use
-        # other commands, and `request_message` waits for the message itself.
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             candidate.count_hardware_request()
-            request = m.CommandLong(
-                system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
-                param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
-            )  # fmt: skip
-            self._send(request, peer)
+            self._send(_hardware_request(system_id), peer)
 
     def record_answer(self, frame: Frame, link: int) -> bool:
         """Record the autopilot's answer to a probe over this link. Return True if the TIMESYNC answers any probe."""
@@ -161,3 +154,13 @@ class LinkProbes:
                 "hardware id in AUTOPILOT_VERSION" if candidate.is_other_hardware else "clock",
             )
             self._bus.publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
+
+
+def _hardware_request(system_id: int) -> m.CommandLong:
+    # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack). The ack of this request
+    # may therefore be taken for that of another REQUEST_MESSAGE. This does no harm, because actions use other commands,
+    # and `request_message` waits for the message itself.
+    return m.CommandLong(
+        system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
+        param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
+    )  # fmt: skip

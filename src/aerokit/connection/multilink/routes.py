@@ -345,31 +345,18 @@ class MultiLinkRoutes:
         used = choice.used
         if reason is None or used is None:
             return
+        link, previous_link = self._link.names[used.link], None
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
             # The link cannot tell for which system the data is, so data for other systems is discarded, too. Commands
             # and transfers send it again.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
-            name = self._link.names[used.link]
-            previous = self._link.names[before.link]
+            previous_link = self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
-            log(
-                "system %d: switched to %s, because %s is %s",
-                system_id,
-                name,
-                previous,
-                _DISADVANTAGE_OF_PREVIOUS.get(reason, reason),
-            )
-        self._bus.publish(
-            LinkSelected(
-                now,
-                system_id,
-                link=self._link.names[used.link],
-                before=None if before is None else self._link.names[before.link],
-                reason=reason,
-            )
-        )
+            disadvantage = _DISADVANTAGE_OF_PREVIOUS.get(reason, reason)
+            log("system %d: switched to %s, because %s is %s", system_id, link, previous_link, disadvantage)
+        self._bus.publish(LinkSelected(now, system_id, link=link, before=previous_link, reason=reason))
         self._states.set_cell(now)
 
     def _probe(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
