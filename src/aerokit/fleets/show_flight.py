@@ -205,8 +205,7 @@ def max_relative_error(
         for name, path in paths.items():
             point = _interpolate(samples.get(name, ()), at_s)
             if point is not None:
-                planned, _ = state_at(path, at_s)
-                errors.append(_difference(planned, point))
+                errors.append(_difference(state_at(path, at_s).place, point))
         if len(errors) > 1:
             relative_errors = (math.dist(first, second) for first, second in combinations(errors, 2))
             largest_m = max(largest_m or 0.0, *relative_errors)
@@ -474,11 +473,10 @@ async def _fly_track(
 
 def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> VelocitySetpoint:
     """Return the velocity of the path at ``at_s + lead_s``, corrected for the deviation at ``at_s``."""
-    planned, _ = state_at(path, at_s)
-    _, velocity = state_at(path, at_s + lead_s)
+    velocity = state_at(path, at_s + lead_s).velocity
     speed = math.hypot(*velocity)
     north, east, up = follow_velocity(
-        _difference(planned, position),
+        _difference(state_at(path, at_s).place, position),
         velocity,
         gain=TRACK_GAIN,
         max_speed_m_s=max(CATCH_UP_FACTOR * speed, CATCH_UP_M_S) + CATCH_UP_M_S,

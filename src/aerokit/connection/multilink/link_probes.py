@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.multilink.vehicle_clock import HardwareId
 from aerokit.events import DuplicateSender
@@ -37,6 +37,12 @@ UNATTACHED_RATE_HZ = 40.0
 _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 
 
+class _Probe(NamedTuple):
+    system_id: int
+    link: int
+    sent_at: float
+
+
 class LinkProbes:
     """Probes each link to a system twice a second, or every five seconds if the link is costly and not in use.
 
@@ -52,7 +58,7 @@ class LinkProbes:
         send: Callable[[Message, Peer], object],
     ) -> None:
         self._names, self._choices, self._bus, self._send = names, choices, bus, send
-        self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 of a probe → system id, link, send time
+        self._pending: dict[int, _Probe] = {}  # the keys are the values of ts1
         self._probed_at: dict[tuple[int, int], float] = {}  # (system id, link) → time of its last probe
         # Token bucket that limits the probes to systems without a vehicle object.
         self._tokens, self._refilled_at = UNATTACHED_RATE_HZ, 0.0
@@ -90,7 +96,7 @@ class LinkProbes:
             return  # The number is invalid, or belongs to another pending probe. The next probe is sent as usual.
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
-        self._pending[ts1] = system_id, candidate.link, now
+        self._pending[ts1] = _Probe(system_id, candidate.link, now)
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             candidate.count_hardware_request()
@@ -134,11 +140,11 @@ class LinkProbes:
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
         """Return the seconds since the probe. None if it was sent to another system or over another link."""
-        probed_system, probed_link, sent_at = self._pending[answer.ts1]
-        if (probed_system, probed_link) != (system_id, link):
+        probe = self._pending[answer.ts1]
+        if (probe.system_id, probe.link) != (system_id, link):
             return None
         del self._pending[answer.ts1]
-        return max(0.0, now - sent_at)
+        return max(0.0, now - probe.sent_at)
 
     def _report_other_vehicle(self, frame: Frame, candidate: Candidate) -> None:
         """Report once that the link seems to lead to another vehicle with the same system id."""
