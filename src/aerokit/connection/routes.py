@@ -72,15 +72,15 @@ class OtherPeer:
             self._clock_matches = clock_matches
 
     @property
-    def is_owner(self) -> bool | None:
-        """True if the owner itself sends from this peer now, False if another sender does; None if unknown."""
+    def is_same_sender(self) -> bool | None:
+        """True if the sender is the owner, which has only changed its address; False if not; None if unknown."""
         return False if self._sequence_matches is False else self._clock_matches
 
     def has_replaced_owner(self, now: float, rate: float) -> bool:
-        """Return True if the owner now sends from this peer only. ``rate`` is its number of frames per second."""
-        # In the time in which the owner usually sends three frames, it has sent none from its old peer.
+        """Return True if the sender has moved to this peer. ``rate`` is its number of frames per second."""
+        # In the time in which the sender usually sends three frames, it has sent none from its old address.
         return (
-            self.is_owner is True
+            self.is_same_sender is True
             and self._frames >= MIN_TAKEOVER_FRAMES
             and (now - self._began_at) * rate >= MIN_TAKEOVER_FRAMES
         )
@@ -131,15 +131,15 @@ class Routes:
     """Routing table: maps each (system id, component id) to the peer that owns the route.
 
     The first peer that sends a HEARTBEAT under these ids owns the route. Frames of other peers under the same ids are
-    dropped (``DuplicateSender``). Their sequence numbers and, where known, their time since boot show whether the owner
-    itself now sends from another peer. The owner is gone once it has disconnected, or after 3.5 s without a heartbeat,
-    not counting pauses of the event loop.
+    dropped (``DuplicateSender``). Their sequence numbers and, where known, their time since boot show whether it is the
+    same sender, which has only changed its address. The owner is gone once it has disconnected, or after 3.5 s without
+    a heartbeat, not counting pauses of the event loop.
 
     Another peer takes over the route (``RouteChanged``)
 
-    1. at once, if it is another port of the same host, and the owner has sent three frames from there and none from its
-       old port;
-    2. when the owner is gone, if the peer is on the same host (as after a reboot), is the owner itself, or signs with
+    1. at once, if it is another port of the same host, and the same sender has sent three frames from there and none
+       from its old port;
+    2. when the owner is gone, if the peer is on the same host (as after a reboot), is the same sender, or signs with
        our key;
     3. when the owner is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
 
@@ -228,7 +228,7 @@ class Routes:
         other = self._other_peer(source, peer)
         self._compare(other, route, frame)
         has_replaced = is_same_host and other.has_replaced_owner(now, route.rate)
-        if has_replaced or (is_silent and (needs_no_evidence or other.is_owner)):
+        if has_replaced or (is_silent and (needs_no_evidence or other.is_same_sender)):
             self._move_route(route, frame, peer)
             return True
         self._report(other, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
@@ -316,11 +316,11 @@ class Routes:
 
     def _report(self, other: OtherPeer, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
         source = frame.system_id, frame.component_id
-        may_be_owner = is_same_host and other.is_owner is not False  # The owner may just have changed its port.
-        if not other.is_duplicate_reported and not may_be_owner:
+        may_be_same = is_same_host and other.is_same_sender is not False  # The sender may just have changed its port.
+        if not other.is_duplicate_reported and not may_be_same:
             other.is_duplicate_reported = True
             self._publish(DuplicateSender(frame.received_at, *source))
-        if is_silent and other.is_owner is False and not other.is_refusal_reported:
+        if is_silent and other.is_same_sender is False and not other.is_refusal_reported:
             other.is_refusal_reported = True
             logger.warning(
                 "%d/%d is silent; frames from %s under the same ids are refused, because they do not continue its"

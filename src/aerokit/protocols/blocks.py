@@ -32,7 +32,7 @@ WIDENING, NARROWING = 0.5, 0.25
 LOSS_WEIGHT, MAX_LOSS = 1 / 16, 0.75
 
 
-class AdaptiveWindow:
+class CongestionWindow:
     """Limits the number of requests in flight to what the link carries without delaying the answers.
 
     The window grows while answers arrive as fast as the fastest answers so far. It shrinks when answers take much
@@ -93,7 +93,7 @@ class BlockRequests:
     """
 
     def __init__(self, round_trip: RoundTrip, *, batch_size: int = BATCH_SIZE, spacing_s: float = SPACING_S) -> None:
-        self.window: AdaptiveWindow = AdaptiveWindow()
+        self.window: CongestionWindow = CongestionWindow()
         self._round_trip = round_trip
         self._batch_size = batch_size
         self._spacing_s = spacing_s
