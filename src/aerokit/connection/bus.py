@@ -291,7 +291,7 @@ class EndSignal:
         """Call ``callback(error)`` when the owner ends, or immediately if the owner has already ended."""
         if self.error is not None:
             callback(self.error)
-            return _nothing
+            return lambda: None
         self._callbacks.append(callback)
 
         def detach() -> None:
@@ -308,10 +308,6 @@ class EndSignal:
                 callback(error)
             except Exception:
                 logger.exception("a callback of on_end() raised an exception; the other callbacks are still called")
-
-
-def _nothing() -> None:
-    pass
 
 
 ItemT = TypeVar("ItemT")

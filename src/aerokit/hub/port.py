@@ -246,10 +246,6 @@ class Port:
         self._due: dict[int, float] = {}  # maps keys of rate-limited streams to the time of their next frame
 
     @property
-    def has_queued_frames(self) -> bool:
-        return bool(self._queue)
-
-    @property
     def waiting(self) -> int:
         return len(self._queue)
 

@@ -256,7 +256,7 @@ class Switch:
                 self._on_error(port, error)
             if port.counters.frames_out > frames_out_before:
                 self._poll_interval_s = MIN_POLL_INTERVAL_S
-            if not port.has_queued_frames:
+            if not port.waiting:
                 self._queueing_ports.pop(port, None)  # The port may have been removed because a write failed.
         if self._queueing_ports:
             self._timer = self._loop.call_later(self._poll_interval_s, self._poll)

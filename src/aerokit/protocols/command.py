@@ -245,7 +245,8 @@ class CommandExchange(Exchange[CommandAck]):
         self._is_sent = is_sent
         self._sent_count = 0  # number of transmissions, including a first one by the caller
         self._dropped_count = 0  # number of these transmissions that no link accepted
-        self._answer_count = 0
+        self.answers: int = 0
+        """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
         self._in_progress = False
 
     def start(self, now: float) -> None:
@@ -261,11 +262,9 @@ class CommandExchange(Exchange[CommandAck]):
         # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
         # command is repeated. A command with a single attempt ignores none, because its own may be the only one.
         may_ignore = self._transmitted_count == 1 and self._attempts > 1
-        is_to_earlier_command = not self._transmitted_count or (
-            may_ignore and self._answer_count < self._earlier_answers
-        )
+        is_to_earlier_command = not self._transmitted_count or (may_ignore and self.answers < self._earlier_answers)
         if message.result != MavResult.IN_PROGRESS:
-            self._answer_count += 1
+            self.answers += 1
         if is_to_earlier_command:
             return
         if message.result == MavResult.IN_PROGRESS:
@@ -280,13 +279,8 @@ class CommandExchange(Exchange[CommandAck]):
         """Number of acknowledgements that may still arrive. The next command with this MAV_CMD must ignore them."""
         # Once the command was repeated, every acknowledgement counts as an answer to this command; see `receive`.
         ignored_answers = self._earlier_answers if self._transmitted_count <= 1 else 0
-        own_answers = max(0, self._answer_count - ignored_answers)
+        own_answers = max(0, self.answers - ignored_answers)
         return max(0, self._transmitted_count * self._acks_per_sending - own_answers)
-
-    @property
-    def answers(self) -> int:
-        """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
-        return self._answer_count
 
     def message_dropped(self) -> None:
         self._dropped_count += 1
