@@ -32,7 +32,7 @@ class ReceivedFrame:
 
     __slots__ = ("_links", "_owner_links", "at", "count", "is_admitted", "is_delivered")
 
-    def __init__(self, at: float, count: int) -> None:
+    def __init__(self, at: float, count: int, link: int, *, is_other_peer: bool) -> None:
         self.at = at
         """Receive time of the first copy."""
         self.count = count
@@ -42,7 +42,8 @@ class ReceivedFrame:
         self.is_delivered = False
         # One bit for each link over which a copy arrived. `_owner_links` omits copies from a second sender with the
         # same ids.
-        self._links = self._owner_links = 0
+        self._links = 1 << link
+        self._owner_links = 0 if is_other_peer else self._links
 
     def add(self, link: int, *, is_other_peer: bool) -> None:
         self._links |= 1 << link
@@ -67,7 +68,7 @@ class Copies:
         # The key has body, checksum and signature of the frame.
         self._seen: dict[tuple[bytes, int, bytes], ReceivedFrame] = {}
         self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
-        self.current: ReceivedFrame = ReceivedFrame(-math.inf, 0)
+        self.current: ReceivedFrame = ReceivedFrame(-math.inf, 0, 0, is_other_peer=True)
         """Record of the last frame that was passed to :meth:`record`."""
         self.may_be_late_copy: bool = False
         """True if this frame may be a copy of one that was delivered over another link some seconds ago."""
@@ -93,8 +94,8 @@ class Copies:
             self.may_be_late_copy = is_other_link and earlier.is_delivered and age_s <= LATE_COPY_WINDOW_S
             del self._seen[key]  # The new frame, which is not a copy, takes the place of the earlier one.
         self._counts[sender] = count + 1
-        self.current = self._seen[key] = ReceivedFrame(frame.received_at, count + 1)
-        self.current.add(link, is_other_peer=is_other_peer)
+        self.current = ReceivedFrame(frame.received_at, count + 1, link, is_other_peer=is_other_peer)
+        self._seen[key] = self.current
         if len(self._seen) > MAX_REMEMBERED:
             # Many frames are forgotten at once, because building the list takes time.
             for oldest_key in list(self._seen)[: MAX_REMEMBERED // 4]:
