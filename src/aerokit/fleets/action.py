@@ -74,7 +74,7 @@ KINDS = {
 
 
 class _SentOrders(NamedTuple):
-    """What this program has ordered a member to do until some time."""
+    """Orders that this program has sent to a member until some time."""
 
     newest: Order | None  # the newest order that moves the vehicle
     command_count: int  # number of commands to disarm; for an action that arms, to arm

@@ -74,7 +74,7 @@ class ForwardingPlan(Generic[PortT]):
 
 
 class Ingress(Generic[PortT]):
-    """What the router stores for frames that arrive at one port."""
+    """Data of the router for the frames that arrive at one port."""
 
     __slots__ = ("destinations", "echoes", "loop_until", "number", "plans", "port", "streams")
 
