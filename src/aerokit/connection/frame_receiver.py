@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Bus
     from aerokit.connection.multilink.routes import MultiLinkRoutes
     from aerokit.connection.routes import Routes
-    from aerokit.connection.signatures import SignatureGate
+    from aerokit.connection.signatures import SignatureFilter
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.statistics import FramerStatistics
@@ -139,10 +139,10 @@ class FrameReceiver:
         bus: Bus,
         routes: Routes | MultiLinkRoutes,
         multilink: MultiLinkRoutes | None,
-        gate: SignatureGate,
+        signatures: SignatureFilter,
         clock: Callable[[], float],
     ) -> None:
-        self._bus, self._gate, self._clock = bus, gate, clock
+        self._bus, self._signatures, self._clock = bus, signatures, clock
         self._routes, self._multilink = routes, multilink
         self._peers = PeerTable(link, bus.dialect, routes.evict_idle_peer, self._update_framer)
         self.framers: dict[Peer, Framer] = self._peers.framers
@@ -152,7 +152,7 @@ class FrameReceiver:
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
         self._is_closed = False  # True once the connection has ended; frames are then dropped
         bus.must_check_frames = multilink is not None
-        gate.on_change = self._update_checks
+        signatures.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
 
     def start(self) -> None:
@@ -198,7 +198,7 @@ class FrameReceiver:
             self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
-        framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
+        framers, multilink, signatures, observers = self.framers, self._multilink, self._signatures, self.observers
         # True if frames arrived out of order (late), or may be those of a second sender with the same ids (foreign).
         has_suspects = bool(framer.late or framer.foreign)
         for frame in frames:
@@ -208,15 +208,17 @@ class FrameReceiver:
             if multilink is not None and multilink.is_duplicate(frame, peer, is_other_peer=is_other_peer):
                 continue
             # With several links, `_is_admitted` is always called, because it records the admission.
-            must_check = multilink is not None or not gate.admits_all
+            must_check = multilink is not None or not signatures.admits_all
             if must_check and not self._is_admitted(frame, is_other_peer):
                 continue
             # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that
             # are not in use.
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
-            if is_other_peer and not self._routes.try_move_route(frame, peer, is_signed=gate.has_verified(frame)):
-                continue
+            if is_other_peer:
+                is_signed = signatures.has_verified(frame)
+                if not self._routes.try_move_route(frame, peer, is_signed=is_signed):
+                    continue
             if has_suspects and self._must_be_dropped(framer, frame):
                 continue
             if multilink is not None:
@@ -270,7 +272,7 @@ class FrameReceiver:
         self._bus.must_check_frames = (
             self._is_closed
             or self._multilink is not None
-            or not self._gate.admits_all
+            or not self._signatures.admits_all
             or self.observers.want_all
             or len(self.framers) > 1
         )
@@ -286,10 +288,10 @@ class FrameReceiver:
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
         if self._multilink is None:
-            return self._gate.admits(frame, may_hand_over=not is_other_peer)
+            return self._signatures.admits(frame, may_hand_over=not is_other_peer)
         current = self._multilink.copies.current  # the record of this frame
         if not current.is_admitted:  # A second check of an admitted frame would refuse it as a replay.
-            current.is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
+            current.is_admitted = self._signatures.admits(frame, may_hand_over=not is_other_peer)
         return current.is_admitted
 
     def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:

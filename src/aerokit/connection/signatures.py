@@ -1,4 +1,4 @@
-"""``SignatureGate``: signs the frames of a connection and refuses received frames without a valid signature."""
+"""``SignatureFilter``: signs the frames of a connection and refuses received frames without a valid signature."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MIN_UNSIGNED_FRAMES = 3
 MIN_UNSIGNED_S = 2.0
 
 
-class SignatureGate:
+class SignatureFilter:
     """Admits the frames that the encoder's ``signing`` accepts, or all frames while that is None.
 
     The first refusal for each reason is logged and published as an event. ``unix_time`` returns seconds since 1970.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
-from aerokit.hub.port import UNLIMITED, EndpointCounters, Port, SigningGateway, joined
+from aerokit.hub.port import UNLIMITED, EndpointCounters, FrameSigner, Port, joined
 from aerokit.hub.senders import IdentityGuard
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.values import EndpointStatistics
@@ -77,9 +77,9 @@ class Attachment:
         self.counters: EndpointCounters = EndpointCounters(Counter())
         self._totals_of_forgotten_peers = _Totals(0, 0, 0, 0)
         self._reported_refusals: set[str] = set()  # reasons that were already reported
-        self._gateway: SigningGateway | None = None  # verifies and adds signatures
+        self._signer: FrameSigner | None = None  # verifies and adds signatures
         if endpoint.signing is not None:
-            self._gateway = SigningGateway(endpoint.signing, dialect.extras, self._on_refused)
+            self._signer = FrameSigner(endpoint.signing, dialect.extras, self._on_refused)
 
     async def open(self) -> None:
         await self.link.open(self)
@@ -228,7 +228,7 @@ class Attachment:
             period=self.filters.period,
             report=partial(self._report, self),
             on_drop=self._on_drop,
-            gateway=self._gateway,
+            signer=self._signer,
             guard=None if self._is_single else self._guard,
             is_read_only=self.endpoint.read_only,
         )

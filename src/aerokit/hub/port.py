@@ -135,7 +135,7 @@ def _to_mavlink2(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
     return bytes((MAGIC_V2,)) + body + x25(body + crc_extra).to_bytes(2, "little")
 
 
-class SigningGateway:
+class FrameSigner:
     """Signs frames that leave an endpoint; verifies and removes the signatures of received frames.
 
     ``unix_time`` is in seconds since 1970. MAVLink 1 frames are sent as MAVLink 2, and refused on reception unless
@@ -219,7 +219,7 @@ class Port:
         period: Callable[[int], float | None],
         report: Callable[[HubEventKind, str], object],
         on_drop: Callable[[str, QueuedFrame], object],
-        gateway: SigningGateway | None = None,
+        signer: FrameSigner | None = None,
         guard: IdentityGuard | None = None,
         is_read_only: bool = False,
     ) -> None:
@@ -229,7 +229,7 @@ class Port:
         self.period: Callable[[int], float | None] = period
         self.report: Callable[[HubEventKind, str], object] = report
         self.reports_bursts: bool = link.reports_bursts
-        self.gateway: SigningGateway | None = gateway
+        self.signer: FrameSigner | None = signer
         self.guard: IdentityGuard | None = guard
         self.is_read_only: bool = is_read_only
         """True if no received frame is forwarded."""
@@ -251,7 +251,7 @@ class Port:
 
     @property
     def joins_frames(self) -> bool:
-        return self.gateway is None and not self.writes_single_frames
+        return self.signer is None and not self.writes_single_frames
 
     def must_queue(self) -> bool:
         return self._may_queue and (bool(self._queue) or self._is_full())
@@ -285,7 +285,7 @@ class Port:
 
     def flush(self, unix_time: float) -> None:
         batch, self.batch = self.batch, []
-        if self.gateway is not None:
+        if self.signer is not None:
             batch = self._signed(batch, unix_time)
         counters, write, peer = self.counters, self.link.write, self.peer
         counters.frames_out += len(batch)  # `Switch` has counted the further frames of joined pieces.
@@ -318,8 +318,8 @@ class Port:
         return self.link.unsent_bytes_to(self.peer) > self._queue_above_bytes
 
     def _signed(self, batch: list[bytes], unix_time: float) -> list[bytes]:
-        assert self.gateway is not None
-        signed = [self.gateway.sign(raw, unix_time) for raw in batch]
+        assert self.signer is not None
+        signed = [self.signer.sign(raw, unix_time) for raw in batch]
         self.counters.dropped["unsignable"] += signed.count(None)
         return [raw for raw in signed if raw is not None]
 

@@ -127,13 +127,13 @@ class Switch:
             port.counters.dropped["read_only"] += len(frames)
             return
         late = framer.late
-        must_check = port.gateway is not None
+        must_check = port.signer is not None
         if guard is not None and not must_check:
             must_check = guard.has_several_peers or _HEARTBEAT_ID in map(_message_id, frames)
         if must_check:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
-            if port.gateway is not None or len(frames) != received_count:
+            if port.signer is not None or len(frames) != received_count:
                 data = None  # The bytes as received are no longer those of the frames to forward.
         if now - arrived_at > ORDER_MAX_AGE_S:
             frames = self._without_commands(port, frames, arrived_at)
@@ -166,9 +166,9 @@ class Switch:
         """Check signatures and ids. Return the accepted frames, and those of them that arrived out of order."""
         admitted: list[Frame] = []
         late: list[Frame] = []
-        gateway, guard, peer = port.gateway, port.guard, port.peer
+        signer, guard, peer = port.signer, port.guard, port.peer
         for received in frames:
-            frame = received if gateway is None else gateway.verify(received, self.unix_time())
+            frame = received if signer is None else signer.verify(received, self.unix_time())
             if frame is None:
                 continue
             # The guard must see every heartbeat. If there is only one peer, its other frames need no check.

@@ -200,9 +200,9 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, received over the link that was in use then."""
-        # Index of the link that delivered `hardware`, or over which a later reboot was detected; -1 if there is none.
+        # Index of the link that delivered `hardware`, or over which a later reboot was detected; None if there is none.
         # The next id over this link replaces `hardware` even if it differs.
-        self._hardware_link = -1
+        self._hardware_link: int | None = None
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
         self.previous: Candidate | None = None
