@@ -73,7 +73,7 @@ class OtherPeer:
 
     @property
     def is_same_sender(self) -> bool | None:
-        """True if the sender is the owner, which has only changed its address; False if not; None if unknown."""
+        """True if this is the owner's sender, which has only changed its address; False if not; None if unknown."""
         return False if self._sequence_matches is False else self._clock_matches
 
     def has_replaced_owner(self, now: float, rate: float) -> bool:
