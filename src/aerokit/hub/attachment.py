@@ -64,8 +64,8 @@ class Attachment:
         self.is_open: bool = False
         self._owns_link = False  # True once this object has opened the link, and therefore must close it
         self._reports_bursts = False  # True if the link calls `burst_ended`
-        # True if the link has a single remote end, e.g. a serial port. Its `Port` has the key None.
-        self._is_single = False
+        # True for e.g. a serial port. The key of its `Port` is None.
+        self._has_single_peer = False
         self._burst: list[bytes] = []  # datagrams of `_burst_peer` that are not processed yet
         self._burst_peer: Peer = None
         self._ports: dict[Peer, Port] = {}
@@ -155,7 +155,7 @@ class Attachment:
             now = self._now()
             # Frames of our own program come without a socket, and therefore have not waited.
             arrived_at = now if self._is_shared else self._switch.arrival(now)
-            port_peer = None if self._is_single else peer
+            port_peer = None if self._has_single_peer else peer
             framer = self._peers.framers.get(port_peer)
             is_whole = False  # True if the data consists of whole valid frames and nothing else
             if framer is not None:
@@ -206,8 +206,8 @@ class Attachment:
 
     def _on_up(self) -> None:
         self.is_open, self._reports_bursts = True, self.link.reports_bursts
-        self._is_single = self.link.has_peer(None)
-        if self._is_single and None not in self._ports:
+        self._has_single_peer = self.link.has_peer(None)
+        if self._has_single_peer and None not in self._ports:
             self._add_port(None)
 
     def _on_down(self) -> None:
@@ -229,7 +229,7 @@ class Attachment:
             report=partial(self._report, self),
             on_drop=self._on_drop,
             signer=self._signer,
-            guard=None if self._is_single else self._guard,
+            guard=None if self._has_single_peer else self._guard,
             is_read_only=self.endpoint.read_only,
         )
         self._guard.has_several_peers = len(self._ports) > 1

@@ -155,7 +155,7 @@ class SettingReads(NamedReads[Setting]):
     def _read_request(self, name: str, index: int) -> Message:
         return ParamExtRequestRead(self.target_system, self.target_component, name, index)
 
-    def _before_sending(self, now: float) -> None:
+    def _check_overdue(self, now: float) -> None:
         self._is_probe_wanted = bool(self._overdue(now))
 
     def _on_message(self, message: Message, now: float) -> None:

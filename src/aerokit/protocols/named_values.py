@@ -182,9 +182,9 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _timeout_text(self, name: str) -> str:
         return f"{name} was not answered, requested {self._window.attempts(name)} times"
 
-    def _before_sending(self, now: float) -> None: ...
+    def _check_overdue(self, now: float) -> None: ...
 
-    def _after_sending(self, now: float) -> None: ...
+    def _send_probe_if_wanted(self, now: float) -> None: ...
 
     def _set_result(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
         self._window.discard(name)
@@ -193,14 +193,14 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
     def _proceed(self, now: float) -> None:
         if len(self._results) < len(self._names):
-            self._before_sending(now)  # This call may settle the last names.
+            self._check_overdue(now)  # This call may set the last results.
         if len(self._results) == len(self._names):
             self._finish({name: self._results[name] for name in self._names})
             return
         for name in self._window.take_due(now):
             self._outbox += self._request(name)
             self._sent_at[name] = now
-        self._after_sending(now)
+        self._send_probe_if_wanted(now)
         times = (self._window.deadline, self._idle_deadline)
         self.deadline: float | None = min(at for at in times if at is not None)
 
@@ -228,7 +228,7 @@ class NamedReads(NamedRequests[ValueT]):
     def _overdue(self, now: float) -> list[str]:
         return [name for name in self._window.overdue(now) if name != PROBE]
 
-    def _after_sending(self, now: float) -> None:
+    def _send_probe_if_wanted(self, now: float) -> None:
         if self._is_probe_wanted and PROBE not in self._window:
             self._window.record_sent(PROBE, now)
             self._outbox += self._request(PROBE)

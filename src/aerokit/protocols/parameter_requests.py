@@ -136,7 +136,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
 
-    def _before_sending(self, now: float) -> None:
+    def _check_overdue(self, now: float) -> None:
         if self._may_probe and (overdue := self._overdue(now)):
             self._reject_if_requested_often(overdue, now)
             self._is_probe_wanted = True
