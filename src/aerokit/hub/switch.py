@@ -41,17 +41,12 @@ class Switch:
     it, otherwise in the next loop iteration.
     """
 
-    def __init__(
-        self,
-        dialect: Dialect,
-        period: Callable[[Port, int], float | None],
-        on_error: Callable[[Port, Exception], object],
-    ) -> None:
+    def __init__(self, dialect: Dialect, on_error: Callable[[Port, Exception], object]) -> None:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
         self._unix_epoch_s = time.time() - self._clock()  # seconds since 1970 at loop time 0
         self._targets = TargetFields(dialect)
-        self.router: Router[Port] = Router(self._targets, period)
+        self.router: Router[Port] = Router(self._targets, lambda port, message_id: port.period(message_id))
         self.router.on_autopilot = _write_single_frames
         self._on_error = on_error
         self._loop_watch = LoopWatch(
