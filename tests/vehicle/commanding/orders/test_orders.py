@@ -216,6 +216,6 @@ def test_reboot_command_is_not_repeated_over_next_link() -> None:
 
 def test_sent_once_commands_are_documented() -> None:
     text = (Path(__file__).parents[4] / "docs" / "reliability.md").read_text()
-    for command, (what, where) in UNREPEATABLE_COMMANDS.items():
-        condition = "" if where is None else f" (param{where[0] + 1} = {where[1]:g})"
-        assert f"| {MavCmd(command).name}{condition} | {what} |" in text
+    for command, (effect, param, value) in UNREPEATABLE_COMMANDS.items():
+        condition = "" if param is None else f" (param{param} = {value:g})"
+        assert f"| {MavCmd(command).name}{condition} | {effect} |" in text
