@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
+    from aerokit.protocols.servers.host import ComponentIds
 
 MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # Two more for a series of pictures and the check of an upload.
 
@@ -54,7 +55,7 @@ class CommandRequest:
         return self._command.command
 
     @property
-    def sender(self) -> tuple[int, int]:
+    def sender(self) -> ComponentIds:
         """System id and component id of the sender."""
         return self._command.sender
 
@@ -92,8 +93,7 @@ class CommandRequest:
         self._report(percent)
 
     def __repr__(self) -> str:
-        system_id, component_id = self.sender
-        return f"<CommandRequest {command_name(self.command)} from {system_id}/{component_id}>"
+        return f"<CommandRequest {command_name(self.command)} from {self.sender.system}/{self.sender.component}>"
 
 
 def outcome_of(value: object) -> Outcome:

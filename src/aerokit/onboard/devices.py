@@ -173,10 +173,9 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
     """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
-        sender_system, _ = request.sender
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).
-            answer = await services.commands.call(authorize, system_id or sender_system)
+            answer = await services.commands.call(authorize, system_id or request.sender.system)
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)

@@ -174,11 +174,9 @@ class GimbalAdapter(GimbalMount):
         self._followed_system_id = 0  # A newer command ends the following.
 
     def look_at(self, place: Place | None) -> None:
-        if place is None:
-            position = None
-        else:
-            latitude_e7, longitude_e7, altitude_amsl_m = place
-            position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
+        position = None
+        if place is not None:
+            position = Position(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, altitude_amsl_m=place.altitude_m)
         self._gimbal.look_at(position)
         # While the gimbal looks at a position, turns of the vehicle do not turn the gimbal.
         self._record(0, is_yaw_locked=position is not None)

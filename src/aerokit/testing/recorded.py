@@ -18,6 +18,7 @@ from aerokit.missions.item import LOCAL_FRAMES
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.protocols.servers.ftp_packets import FtpPacket
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
@@ -180,7 +181,7 @@ class RecordedMissions(MissionServer):
         return results[min(number, len(results) - 1)]
 
 
-def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, wants_float: bool) -> AnyItem:
+def _item_message(item: AnyItem, seq: int, client: ComponentIds, *, wants_float: bool) -> AnyItem:
     """Convert a recorded item to MISSION_ITEM (``wants_float``) or MISSION_ITEM_INT."""
     # In MISSION_ITEM_INT, x and y are degrees times 1e7, in local frames metres times 1e4, and in MAV_FRAME_MISSION
     # numbers without a scale.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandCancel, CommandInt, CommandLong
-from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ReceivedCommand:
     frame: int | None
     """MAV_FRAME of a COMMAND_INT; None for COMMAND_LONG."""
     channel: Channel
-    sender: tuple[int, int]
+    sender: ComponentIds
     confirmation: int = 0
     """Number of earlier transmissions of this COMMAND_LONG."""
 
@@ -144,10 +144,9 @@ class CommandDispatcher:
 
     def answer(self, command: ReceivedCommand, result: int, progress: int = 0, detail: int = 0) -> None:
         """Send an acknowledgement with ``detail`` as its ``result_param2``."""
-        system, component = command.sender
         ack = CommandAck(
-            command.command, result, progress=progress, result_param2=detail, target_system=system,
-            target_component=component,
+            command.command, result, progress=progress, result_param2=detail, target_system=command.sender.system,
+            target_component=command.sender.component,
         )  # fmt: skip
         self._host.send(ack, command.channel)
 
@@ -174,6 +173,14 @@ class Outcome(NamedTuple):
     detail: int = 0
 
 
+class EndedCommand(NamedTuple):
+    """A command that has ended, and the time of its end."""
+
+    command: ReceivedCommand
+    outcome: Outcome
+    ended_at: float
+
+
 class RunningCommand:
     """A command that is being executed. ``cancel`` returns False if the command cannot be cancelled."""
 
@@ -198,9 +205,8 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # Maps (MAV_CMD, sender) to the last command that has ended, its result, and the time of its end. The command
-        # that ended last is the last entry.
-        self._ended: dict[tuple[int, tuple[int, int]], tuple[ReceivedCommand, Outcome, float]] = {}
+        # The last command that has ended, by MAV_CMD and sender. The command that ended last is the last entry.
+        self._ended: dict[tuple[int, ComponentIds], EndedCommand] = {}
         host.on(CommandCancel, self._on_cancel)
 
     def __len__(self) -> int:
@@ -219,12 +225,11 @@ class RunningCommands:
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
         ended = self._ended.get((command.command, command.sender))
+        has_result = ended is not None and self._host.now - ended.ended_at <= RESULT_MAX_AGE_S
         # A stop command is executed again, because it may be a new one whose first transmission was lost.
-        if ended is not None and not is_stop:
-            ended_command, outcome, ended_at = ended
-            if _is_repeated(command, ended_command) and self._host.now - ended_at <= RESULT_MAX_AGE_S:
-                self._server.answer(command, *outcome)
-                return None
+        if ended is not None and has_result and not is_stop and _is_repeated(command, ended.command):
+            self._server.answer(command, *ended.outcome)
+            return None
         if running is not None and is_stop and self._end_for(running, command):
             running = None
         if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
@@ -269,7 +274,7 @@ class RunningCommands:
         self._ended.pop(key, None)  # The new entry must be the last one.
         if len(self._ended) >= MAX_RESULTS:
             del self._ended[next(iter(self._ended))]
-        self._ended[key] = (command, outcome, self._host.now)
+        self._ended[key] = EndedCommand(command, outcome, self._host.now)
 
     def cancel_all(self) -> None:
         for running in tuple(self._running.values()):

@@ -13,7 +13,7 @@ from aerokit.mavlink.enums import MavParamError, MavParamExtType, ParamAck
 from aerokit.parameters import Parameter, ParameterType, SettingValue
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
-from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
 
 MAX_LISTS = 8
 """Maximum number of lists that a component sends at once; it ignores further requests."""
@@ -118,7 +118,7 @@ class ParameterProtocolServer(ParameterLists):
     def send(self, name: str, index: int, channel: Channel) -> None:
         self._host.send(self.value_message(name, index), channel)
 
-    def send_error(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
+    def send_error(self, to: ComponentIds, name: str, index: int, code: int, channel: Channel) -> None:
         self._host.send(m.ParamError(*to, name, index, code), channel)
 
 
