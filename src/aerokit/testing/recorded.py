@@ -78,12 +78,10 @@ class RecordedParameters(ParameterProtocolServer):
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        name_and_index = self.requested(request.param_id, request.param_index)
+        if self.send_requested(request.param_id, request.param_index, channel):
+            return
         is_by_name = request.param_index < 0
-        if name_and_index is not None:
-            name, index = name_and_index
-            self.send(name, index, channel)
-        elif is_by_name and request.param_id == HASH_NAME and self._has_hash:
+        if is_by_name and request.param_id == HASH_NAME and self._has_hash:
             self.send(HASH_NAME, UNKNOWN_INDEX, channel)
         else:
             self._refuse(request, request.param_index, channel)

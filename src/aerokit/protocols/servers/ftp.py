@@ -405,8 +405,7 @@ class SessionFtpServer(Generic[FilesT]):
 
 
 def _line(entry: Entry) -> bytes:
-    name, size = entry
-    return (f"D{name}" if size is None else f"F{name}\t{size}").encode()
+    return (f"D{entry.name}" if entry.size is None else f"F{entry.name}\t{entry.size}").encode()
 
 
 _HANDLERS: dict[int, Callable[[SessionFtpServer[Any], FtpPeer, FtpPacket], FtpPacket | None]] = {

@@ -216,8 +216,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         entries = super()._entries(path)
         if self.files.mounted(path) is not None:
             return entries
-        mounts = [(name, None) for name, mount in self.files.mounts.items() if mount.is_listed]
-        return [(".", None), ("..", None), *entries, *(mounts if path == "/" else [])]
+        mounts = [Entry(name, None) for name, mount in self.files.mounts.items() if mount.is_listed]
+        return [Entry(".", None), Entry("..", None), *entries, *(mounts if path == "/" else [])]
 
     def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
         if self.files.mounted(self._path(request)) is not None:
