@@ -64,9 +64,8 @@ class ParameterAccess:
         self._cached_read_round_trip: RoundTrip | None = None  # see `_read_round_trip`
         self._boosts = 0  # number of running operations that need a raised rate of answers
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
-        # Last value of each parameter that this program has written and the vehicle has confirmed.
-        self.written: dict[str, int | float] = {}
-        self._attempted: set[str] = set()  # names that this program has ever tried to write
+        # Last value of each parameter that this program has written; None until the vehicle confirms the value.
+        self.written: dict[str, int | float | None] = {}
 
     @property
     def _read_round_trip(self) -> RoundTrip:
@@ -222,7 +221,7 @@ class ParameterAccess:
         from aerokit.protocols.parameter_requests import ParameterReads
 
         transfers, store = self._transfers, self.store
-        replaced_values = {name: store.replaced_value(name) for name in names}
+        stale_values = {name: store.stale(name) for name in names}
         exchange = ParameterReads(
             transfers.system_id,
             transfers.component_id,
@@ -230,7 +229,7 @@ class ParameterAccess:
             bytewise=store.bytewise,
             probe=probe,
             alternatives={name: other_names(name) for name in names} if probe else {},
-            possibly_stale={name: value for name, value in replaced_values.items() if value is not None},
+            possibly_stale={name: stale.value for name, stale in stale_values.items() if stale is not None},
             own_system=transfers.connection.source_system,
             round_trip=self._read_round_trip,
             idle_timeout_s=idle_timeout_s,
@@ -334,7 +333,7 @@ class ParameterAccess:
             self.written[name] = answer.value
             # A late answer with the previous value must not replace the new one in the store.
             if name in old_values and answer.value != old_values[name]:
-                self.store.mark_replaced(name, old_values[name])
+                self.store.set_stale(name, old_values[name])
             stored = self.store.get(name)
             if stored is not None and not same_value(stored.value, answer.value):
                 # Another value arrived after the answer. It may be a late answer, so the parameter is read again.
@@ -346,15 +345,16 @@ class ParameterAccess:
 
         The last write was cancelled or not confirmed, or a message with another value has arrived after it.
         """
-        known, written = self.store.get(name), self.written.get(name)
-        return name in self._attempted and not (known and written is not None and same_value(known.value, written))
+        if name not in self.written:
+            return False
+        known, written = self.store.get(name), self.written[name]
+        return known is None or written is None or not same_value(known.value, written)
 
     def _forget_written(self, names: Iterable[str]) -> None:
         # The vehicle may have other values from now on.
         for name in names:
-            self._attempted.add(name)
-            self.written.pop(name, None)
-            self.store.unmark_replaced(name)
+            self.written[name] = None
+            self.store.clear_stale(name)
 
     def _recently_written(self) -> set[str]:
         # A late answer to the last write of these parameters could be taken for the answer to their next write. The
