@@ -267,7 +267,7 @@ CALIBRATION_TIMEOUT_S = 35.0
 
 REBOOT_TIMEOUT_S = 3.0
 
-TUNE_SIZES = (30, 200)  # characters in the fields `tune` and `tune2` of PLAY_TUNE
+TUNE_SIZE, TUNE2_SIZE = 30, 200  # characters in the fields `tune` and `tune2` of PLAY_TUNE
 
 
 class Maintenance(VehicleCore):
@@ -320,8 +320,7 @@ class Maintenance(VehicleCore):
         text = _tune_text(tune)
         if self._dk.check_link().connection.mavlink_version == 1:
             raise APIException("play_tune needs MAVLink 2, and this vehicle uses MAVLink 1")
-        first_size, _ = TUNE_SIZES
-        self._dk.send(PlayTune(self._dk.target_system, 0, text[:first_size], text[first_size:]))
+        self._dk.send(PlayTune(self._dk.target_system, 0, text[:TUNE_SIZE], text[TUNE_SIZE:]))
 
     def reboot(self) -> None:
         """Reboot the autopilot, which then does not answer for some seconds. An armed vehicle refuses.
@@ -347,8 +346,9 @@ def _tune_text(tune: str | bytes) -> str:
         text = data.rstrip(b"\0").decode("ascii")
     except (UnicodeError, AttributeError):
         raise InvalidArgument(f"tune = {tune!r} is not allowed: it must be ASCII text") from None
-    if "\0" in text or len(text) > sum(TUNE_SIZES):
+    max_size = TUNE_SIZE + TUNE2_SIZE
+    if "\0" in text or len(text) > max_size:
         raise InvalidArgument(
-            f"tune of {len(text)} characters is not allowed: at most {sum(TUNE_SIZES)} characters, none of them NUL"
+            f"tune of {len(text)} characters is not allowed: at most {max_size} characters, none of them NUL"
         )
     return text
