@@ -41,6 +41,13 @@ class RemoteFile(NamedTuple):
     size: int
 
 
+class _ClosingSession(NamedTuple):
+    """A session that is being closed in the background."""
+
+    request: FtpRequest
+    task: asyncio.Task[None]
+
+
 @contextmanager
 def _limit(
     description: str, timeout: float | None, missing: Callable[[], tuple[tuple[int, int], ...]]
@@ -69,9 +76,7 @@ class FileChannel:
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
-        # Maps the id of each session that is being closed in the background to the request that closes it, and to the
-        # task that sends this request.
-        self._closing: dict[int, tuple[FtpRequest, asyncio.Task[None]]] = {}
+        self._closing: dict[int, _ClosingSession] = {}  # by session id
 
     @asynccontextmanager
     async def operation(
@@ -216,17 +221,17 @@ class FileChannel:
             self.transfers.connection.send(request.message)
             task = self.transfers.background.start(lambda: self._confirm(request), "aerokit close file")
             if task is not None:
-                self._closing[session] = (request, task)
+                self._closing[session] = _ClosingSession(request, task)
 
     async def _confirm(self, request: FtpRequest) -> None:
         with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
             await self.transfers.run(request)
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
-        request, task = self._closing[session]
-        await asyncio.wait((task,))
-        if not request.is_answered:
-            await self._close(session, request.path, idle_timeout_s)
+        closing = self._closing[session]
+        await asyncio.wait((closing.task,))
+        if not closing.request.is_answered:
+            await self._close(session, closing.request.path, idle_timeout_s)
         self._closing.pop(session, None)
 
 

@@ -255,7 +255,9 @@ class Logs:
             if path is not None:
                 return path, log
         try:
-            entry = await self._entry(log, idle_timeout_s, timeout, gives_up_early=method == "auto")
+            # With "auto", another method may work, so give up early.
+            max_unanswered = MAX_UNANSWERED_REQUESTS if method == "auto" else None
+            entry = await self._entry(log, idle_timeout_s, timeout, max_unanswered)
         except FileTimeout:
             # ArduPilot does not answer LOG_* messages while it is armed. MAVFTP can read a log whose entry is known.
             if not isinstance(log, LogEntry) or method != "auto":
@@ -279,17 +281,13 @@ class Logs:
         return await log_path(self._files, directories, entry, idle_timeout_s, may_have_grown=entry == self._newest)
 
     async def _entry(
-        self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, gives_up_early: bool
+        self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, max_unanswered: int | None
     ) -> LogEntry:
-        """Return the current entry of a log.
-
-        With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
-        """
+        """Return the current entry of a log."""
         log_id = log if isinstance(log, int) else log.id
         # For an id, request the whole list, because the log may not exist. ArduPilot answers the request for a single
         # nonexistent log by an endless list of nonexistent logs.
         only_id = None if isinstance(log, int) else log.id
-        max_unanswered = MAX_UNANSWERED_REQUESTS if gives_up_early else None
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only_id, max_unanswered)
         current = next((entry for entry in entries if entry.id == log_id), None)

@@ -293,23 +293,10 @@ class MissionControl(VehiclePlan["Mission"]):
             NotSupported: this type of vehicle has no mission mode.
         """
         self._check_item(item)
-        vehicle_context, session = self._vehicle_context, self._session
-        mode = vehicle_context.sender.mode_for("mission.start", "mission")
-        if not session.telemetry.is_armed:
+        mode = self._vehicle_context.sender.mode_for("mission.start", "mission")
+        if not self._session.telemetry.is_armed:
             raise OperationRejected("mission.start: the vehicle is not armed: call arm() first; nothing was sent")
-        order = vehicle_context.arbiter.order(mode)
-        self._order = order
-        self._tracker.start()
-        try:
-            with vehicle_context.flight_cleanup.flying(order):
-                await self._set_current(item, timeout, order, keeps_jump_counts=False)
-                await self._enter_mode(mode, order, timeout)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the order.
-            vehicle_context.flight_cleanup.hold_in_background(order)
-            raise
-        if self._order is order:  # Otherwise, another task has paused the mission again.
-            self._is_paused = False
+        await self._fly(mode, timeout, first_item=item)
 
     async def pause(self) -> None:
         """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
@@ -339,15 +326,21 @@ class MissionControl(VehiclePlan["Mission"]):
 
         If its parameter MIS_RESTART is 1, ArduPilot starts again from the first item. Raises as :meth:`start`.
         """
-        vehicle_context, session = self._vehicle_context, self._session
-        mode = vehicle_context.sender.mode_for("mission.resume", "mission")
-        if not session.telemetry.is_armed:
+        mode = self._vehicle_context.sender.mode_for("mission.resume", "mission")
+        if not self._session.telemetry.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
+        await self._fly(mode, timeout)
+
+    async def _fly(self, mode: Mode, timeout: float, first_item: int | None = None) -> None:
+        """Make the vehicle fly its mission from ``first_item`` on, or from the current item."""
+        vehicle_context = self._vehicle_context
         order = vehicle_context.arbiter.order(mode)
         self._order = order
         self._tracker.start()
         try:
             with vehicle_context.flight_cleanup.flying(order):
+                if first_item is not None:
+                    await self._set_current(first_item, timeout, order, keeps_jump_counts=False)
                 await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the order.
@@ -386,7 +379,7 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
         cache = self._context.caches[MavMissionType.MISSION]
         items = (cache.items or ())[self._context.offset_of(MavMissionType.MISSION) :]
-        _, plan_id = self._version
+        plan_id = self._version.plan_id
         has_other_id = cache.plan_id != 0 and plan_id != cache.plan_id
         if has_other_id or self._tracker.count.latest not in (None, len(items)):
             items = ()  # Another ground station has replaced the mission, so its items are unknown.
@@ -441,7 +434,6 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item."""
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
@@ -470,7 +462,7 @@ class MissionControl(VehiclePlan["Mission"]):
                         return
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
 
-    async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand | None = None) -> None:
+    async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand) -> None:
         from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
@@ -478,9 +470,8 @@ class MissionControl(VehiclePlan["Mission"]):
         with transfers.limit(timeout):
             await self._context.lock.acquire()  # PX4 ignores MISSION_SET_CURRENT during a transfer.
         try:
-            if sent is not None:
-                self._vehicle_context.sender.raise_if_ended(sent.order)
-                await self._vehicle_context.sender.await_recent_state(sent.order)
+            self._vehicle_context.sender.raise_if_ended(sent.order)
+            await self._vehicle_context.sender.await_recent_state(sent.order)
             await transfers.run(
                 SetCurrentItem(
                     *target,
