@@ -247,73 +247,78 @@ class ComponentCommands:
         *,
         is_stop: bool = False,
     ) -> None:
-        task: asyncio.Task[Any] | None = None
-        is_cancelled = False
+        execution = _Execution(self, function)
+        running = self._running.start(command, execution.cancel, is_stop=is_stop)
+        if running is not None:  # Otherwise start() has answered: it is a repetition, or another command is running.
+            execution.begin(running, arguments)
 
-        # `cancel` is called after this method has returned, when `returned` and `running` below are set.
-        def cancel() -> bool:
-            nonlocal is_cancelled
-            if task in self._tasks_in_threads:
-                return False  # The command cannot be cancelled. Its sender gets the result.
-            if task is not None:
-                task.cancel()
-            elif not is_cancelled:  # The task has not started yet.
-                is_cancelled = True
-                if inspect.iscoroutine(returned):
-                    returned.close()
-                self._running.finish(running, Outcome(MavResult.CANCELLED))
-            return True
 
-        started = self._running.start(command, cancel, is_stop=is_stop)
-        if started is None:  # start() has answered already: the command is a repetition, or another command is running.
-            return
-        running = started  # Unlike `started`, this is never None, which type checkers require in the closures.
-        loop = asyncio.get_running_loop() if self.uses_threads else None
+class _Execution:
+    """One execution of a command handler, as a task if the handler returns an awaitable."""
 
-        def report(percent: int) -> None:
-            if loop is None:
-                self._running.report(running, percent)
-            else:  # The handler may run in a thread, which must not call the event loop's objects directly.
-                loop.call_soon_threadsafe(self._running.report, running, percent)
+    _running: RunningCommand
+    _returned: Any  # what the handler has returned
 
-        request = CommandRequest(command, report)
+    def __init__(self, commands: ComponentCommands, function: Callable[..., Any]) -> None:
+        self._commands, self._function = commands, function
+        self._loop = asyncio.get_running_loop()
+        self._task: asyncio.Task[Any] | None = None  # None before the task has started
+        self._is_cancelled = False  # True if cancelled before the task has started
+
+    def begin(self, running: RunningCommand, arguments: tuple[CommandArgument, ...]) -> None:
+        self._running = running
+        request = CommandRequest(running.command, self._report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            returned = self.begin(function, request, *values)
-            outcome = None if inspect.isawaitable(returned) else outcome_of(returned)
+            self._returned = self._commands.begin(self._function, request, *values)
+            outcome = None if inspect.isawaitable(self._returned) else outcome_of(self._returned)
         except Exception as error:
-            self._finish_with_error(running, function, error)
+            self._finish_with_error(error)
             return
         if outcome is not None:
-            self._running.finish(running, outcome)
+            self._finish(outcome)
+        elif self._commands._tasks.start(self._run, f"aerokit {command_name(running.command.command)}") is None:
+            self.cancel()  # The component is closing.
+
+    def cancel(self) -> bool:
+        """Cancel the handler. Return False if it runs in a thread, which cannot be cancelled."""
+        if self._task in self._commands._tasks_in_threads:
+            return False  # The sender gets the result.
+        if self._task is not None:
+            self._task.cancel()
+        elif not self._is_cancelled:
+            self._is_cancelled = True
+            if inspect.iscoroutine(self._returned):
+                self._returned.close()
+            self._finish(Outcome(MavResult.CANCELLED))
+        return True
+
+    async def _run(self) -> None:
+        if self._is_cancelled:
             return
-
-        async def run() -> None:
-            nonlocal task
-            if is_cancelled:
-                return
-            task = asyncio.current_task()
-            await self._finish_when_done(running, function, returned)
-
-        if self._tasks.start(run, f"aerokit {command_name(command.command)}") is None:  # The component is closing.
-            cancel()
-
-    async def _finish_when_done(
-        self, running: RunningCommand, function: Callable[..., Any], returned: Awaitable[Any]
-    ) -> None:
+        self._task = asyncio.current_task()
         try:
-            outcome = outcome_of(await returned)
+            outcome = outcome_of(await self._returned)
         except asyncio.CancelledError:
-            self._running.finish(running, Outcome(MavResult.CANCELLED))
+            self._finish(Outcome(MavResult.CANCELLED))
             raise
         except Exception as error:
-            self._finish_with_error(running, function, error)
+            self._finish_with_error(error)
         else:
-            self._running.finish(running, outcome)
+            self._finish(outcome)
 
-    def _finish_with_error(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
-        name = getattr(function, "__name__", "run")
+    def _report(self, percent: int) -> None:
+        if self._commands.uses_threads:  # A thread must not call the event loop's objects directly.
+            self._loop.call_soon_threadsafe(self._commands._running.report, self._running, percent)
+        else:
+            self._commands._running.report(self._running, percent)
+
+    def _finish(self, outcome: Outcome) -> None:
+        self._commands._running.finish(self._running, outcome)
+
+    def _finish_with_error(self, error: Exception) -> None:
+        name = getattr(self._function, "__name__", "run")
         if name == "run":  # The name of aerokit's own wrapper tells the sender nothing.
-            name = command_name(running.command.command)
-        self._host.report_error(name, error)
-        self._running.finish(running, Outcome(result_of(error)))
+            name = command_name(self._running.command.command)
+        self._commands._host.report_error(name, error)
+        self._finish(Outcome(result_of(error)))
