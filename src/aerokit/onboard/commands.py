@@ -163,9 +163,9 @@ class ComponentCommands:
             self._execute(function, arguments, received, is_stop=is_stop(received))
 
         arguments = arguments_of(function)
-        self.add_handlers({command: execute})
+        self._register({command: execute})
 
-    def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
+    def _register(self, handlers: Mapping[int, CommandHandler]) -> None:
         """Register handlers that check the parameters themselves.
 
         Raises InvalidArgument if a command already has a handler.
@@ -188,7 +188,7 @@ class ComponentCommands:
 
             return guarded
 
-        self.add_handlers({command: guard(handler) for command, handler in handlers.items()})
+        self._register({command: guard(handler) for command, handler in handlers.items()})
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function of the program, and wait for its result.
@@ -228,7 +228,7 @@ class ComponentCommands:
         async def run(request: CommandRequest) -> int:
             return await function(request._command)
 
-        self.add_handlers({command: partial(self._execute, run, ())})
+        self._register({command: partial(self._execute, run, ())})
 
     def cancel_all(self) -> None:
         self._running.cancel_all()

@@ -132,10 +132,10 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
             raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
         if method == "set_rate":
             can_hold = overrides(winch, WinchDriver, "hold")
-            services.motions["winch"] = winch.hold if can_hold else partial(winch.set_rate, 0.0)
+            services.stop_functions["winch"] = winch.hold if can_hold else partial(winch.set_rate, 0.0)
         await services.commands.call(getattr(winch, method), *arguments)
         if method != "set_rate" or rate == 0:
-            services.motions.pop("winch", None)
+            services.stop_functions.pop("winch", None)
 
     def status() -> m.WinchStatus:
         report = winch.report()
