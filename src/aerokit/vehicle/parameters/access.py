@@ -46,7 +46,7 @@ MAX_READS_UNBOOSTED = 5
 # lacks a parameter, whose request must be repeated.
 BOOST_DELAY_S = 0.5
 # Fewer changes than this are set one by one. A file would not be faster, and the vehicle confirms each value.
-MIN_PACK_SIZE = 10
+MIN_CHANGES_FOR_FILE = 10
 # If more values than this must be read back, the whole list is downloaded instead.
 MAX_READ_BACK = 100
 
@@ -60,7 +60,7 @@ class ParameterAccess:
         self._read_later_names: set[str] = set()  # names that `_read_later` will read
         self._download_lock = asyncio.Lock()
         self._write_lock = asyncio.Lock()
-        self._has_pack: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
+        self._has_file: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
         self._cached_read_round_trip: RoundTrip | None = None  # see `_read_round_trip`
         self._boosts = 0  # number of running operations that need a raised rate of answers
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
@@ -81,7 +81,7 @@ class ParameterAccess:
 
     def forget(self) -> None:
         self.store.forget()
-        self._has_pack = None
+        self._has_file = None
 
     async def download(
         self,
@@ -112,12 +112,12 @@ class ParameterAccess:
                     return self.store.table
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
-        if method == "ftp" or (method == "auto" and await self.has_pack()):
+        if method == "ftp" or (method == "auto" and await self.has_file()):
             # With "auto", the probe ends the attempt if MAVFTP does not answer, and the list is downloaded instead.
             probe = nullcontext() if method == "ftp" else self._ftp_probe()
             try:
                 with probe:
-                    await self._download_pack(idle_timeout_s, on_progress)
+                    await self._download_file(idle_timeout_s, on_progress)
                 return
             except (FileError, FileTimeout, RemoteProtocolError) as error:
                 if method == "ftp":
@@ -126,7 +126,7 @@ class ParameterAccess:
                 is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
-                self._has_pack = None if is_temporary else False  # With None, the next download tries the file again.
+                self._has_file = None if is_temporary else False  # With None, the next download tries the file again.
         await self._download_list(idle_timeout_s, on_progress)
 
     @contextmanager
@@ -158,13 +158,13 @@ class ParameterAccess:
         if scope.cancelled_caught:
             raise FileTimeout(f"the vehicle did not answer MAVFTP requests within {timeout_s:.1f} s")
 
-    async def has_pack(self) -> bool:
-        if self._has_pack is not None:
-            return self._has_pack
+    async def has_file(self) -> bool:
+        if self._has_file is not None:
+            return self._has_file
         capabilities = await self._transfers.capabilities()
         return bool(capabilities and capabilities & MavProtocolCapability.FTP)
 
-    async def _download_pack(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
+    async def _download_file(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         from aerokit.parameters.pack import PACK_PATH, PACK_PATH_WITH_DEFAULTS, unpack_parameters
 
         # ArduPilot generates the file while it is read. If a parameter changes from its default value meanwhile, all
@@ -180,7 +180,7 @@ class ParameterAccess:
                     raise
             else:
                 self.store.replace(self._with_known_defaults(table), updates_before=updates_before)
-                self._has_pack = True
+                self._has_file = True
                 return
 
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
@@ -363,7 +363,7 @@ class ParameterAccess:
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
 
-    async def write_pack(
+    async def write_file(
         self,
         parameters: Iterable[Parameter],
         method: UploadMethod,
@@ -377,7 +377,7 @@ class ParameterAccess:
         parameters = tuple(parameters)
         if not parameters:
             return {}
-        if method == "auto" and (len(parameters) < MIN_PACK_SIZE or not await self.has_pack()):
+        if method == "auto" and (len(parameters) < MIN_CHANGES_FOR_FILE or not await self.has_file()):
             method = "set"
         if method == "set":
             return await self.write(parameters, idle_timeout_s, on_progress)
@@ -387,7 +387,7 @@ class ParameterAccess:
         async with self._write_lock:
             self._forget_written(_names(parameters))
             try:
-                await self._upload_pack(parameters, idle_timeout_s, on_progress)
+                await self._upload_file(parameters, idle_timeout_s, on_progress)
                 answers = await self._read_back(parameters, idle_timeout_s)
             except (FileError, FileTimeout):  # With "auto", all parameters are set one by one instead.
                 if method == "ftp":
@@ -398,7 +398,7 @@ class ParameterAccess:
             later_answers = await self._write(not_applied, idle_timeout_s, on_progress)
             return {param.name: answers[param.name] for param in applied} | later_answers
 
-    async def _upload_pack(
+    async def _upload_file(
         self, parameters: tuple[Parameter, ...], idle_timeout_s: float, on_progress: OnProgress | None
     ) -> None:
         from aerokit.parameters.pack import PACK_PATH, pack_parameters

@@ -309,7 +309,7 @@ class ParameterWriter:
         # Two names may mean the same parameter, which must be in the file only once.
         changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}.values()
         unchanged: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_unchanged}
-        return unchanged | await self._access.write_pack(changed, upload, idle_timeout_s, on_progress)
+        return unchanged | await self._access.write_file(changed, upload, idle_timeout_s, on_progress)
 
     def _plan_writes(
         self,
