@@ -248,7 +248,6 @@ class BaseLink(Link):
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
-        """Notify the receiver if the link has stalled or drained."""
         stalled_since = self._stalled_at  # None if the link was not stalled until now
         if is_stalled == (stalled_since is not None):
             return

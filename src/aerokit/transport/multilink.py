@@ -177,7 +177,7 @@ class MultiLink(Link):
 
     @property
     def _own_links(self) -> list[Link]:
-        return [member.link for member in self._members if not member.is_foreign]
+        return [member.link for member in self._members if member.owns_link]
 
     # ------------------------------------------------------------------------------- opening
 
@@ -279,7 +279,7 @@ class _Member:
         self.index = index
         self.link = make_link()
         self.is_available = False  # True while the link is open
-        self.is_foreign = False  # True if another connection has opened the link, which must not be closed here
+        self.owns_link = True  # False if another connection has opened the link, which must not be closed here
         self.kept_peers: set[Peer] = set()  # After a reopening, `keep_peer` is called again for them.
         self.keeps_peers = False  # see `PeerKeeper`
         self._is_lost = False
@@ -288,13 +288,13 @@ class _Member:
         """Open the link. Return the error if another attempt may succeed."""
         receiver = self._owner._receiver
         self.keeps_peers = receiver is not None and keeps_peers(receiver)
-        self._is_lost = self.is_foreign = False
+        self._is_lost, self.owns_link = False, True
         try:
             await self.link.open(self)
         except LinkOpenError as error:
             return error
         except BusyError:  # The given link object is already used by another connection.
-            self.is_foreign = True
+            self.owns_link = False
             raise
         if not self._is_lost:
             self._set_available()
@@ -302,7 +302,7 @@ class _Member:
 
     def replace_link(self) -> None:
         """Make a new link, because a closed link cannot be opened again."""
-        if not self.is_foreign:
+        if self.owns_link:
             self.link = self._make_link()
         self.is_available = False
 

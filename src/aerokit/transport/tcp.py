@@ -120,7 +120,6 @@ class TcpConnect(_TcpLink):
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
-        """Connect to the first address that accepts."""
         first_error: OSError | None = None
         for address in addresses:
             try:

@@ -34,7 +34,7 @@ class FtpSession:
     size: int
     is_writing: bool
     next_block: FtpPacket | None = field(default=None, repr=False)
-    """Sequence number and offset of the next block of the running burst; None if none runs."""
+    """Request for the next block of the running burst; None if none runs."""
     burst_sent: int = 0
     """Number of bytes that the current burst has sent."""
 
@@ -292,8 +292,7 @@ class SessionFtpServer(Generic[FilesT]):
         """Start a burst, or move a running one to another offset."""
         session = self._session_of(peer, request)
         is_running = session.next_block is not None
-        first_sequence = (request.sequence + 1) & 0xFFFF
-        session.next_block = request.replace(sequence=first_sequence)
+        session.next_block = request
         session.burst_sent = 0
         if not is_running:
             self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
@@ -308,30 +307,28 @@ class SessionFtpServer(Generic[FilesT]):
         if session.next_block is not None:
             self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
-    def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
+    def _send_block(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, *, may_end: bool) -> None:
         """Send a block of a burst, or the NAK that ends the burst.
 
         With ``may_end``, this block is the burst's last one if it has sent enough bytes.
         """
-        # Unlike in a request, the sequence number in `burst` is already that of the reply.
-        number = session.number
-        answer = burst.acknowledge(offset=burst.offset, session=number).replace(sequence=burst.sequence)
-        refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=number)
+        refusal = request.refuse(MavFtpErr.EOF)
         try:
-            data = b"" if burst.offset >= session.size else session.file.read(burst.offset, DATA_SIZE)
+            data = b"" if request.offset >= session.size else session.file.read(request.offset, DATA_SIZE)
         except FileFault as fault:
             data = b""
             peer.errno = fault.errno
-            refusal = refusal.replace(data=bytes([MavFtpErr.FAILERRNO, peer.errno]), size=2)
+            refusal = request.refuse(MavFtpErr.FAILERRNO, fault.errno)
         if not data:
             session.next_block = None
-            self._reply(peer, refusal)
+            self._reply(peer, refusal.replace(offset=request.offset, session=session.number))
             return
         session.burst_sent += len(data)
         is_complete = may_end and session.burst_sent > _BURST_BYTES
-        self._reply(peer, answer.replace(data=data, size=len(data), burst_complete=is_complete))
-        next_sequence = (burst.sequence + 1) & 0xFFFF
-        next_block = burst.replace(sequence=next_sequence, offset=burst.offset + len(data))
+        answer = request.acknowledge(data, offset=request.offset, session=session.number)
+        self._reply(peer, answer.replace(burst_complete=is_complete))
+        next_sequence = (request.sequence + 1) & 0xFFFF
+        next_block = request.replace(sequence=next_sequence, offset=request.offset + len(data))
         session.next_block = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:

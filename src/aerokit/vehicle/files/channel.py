@@ -42,8 +42,6 @@ class RemoteFile(NamedTuple):
 
 
 class _ClosingSession(NamedTuple):
-    """A session that is being closed in the background."""
-
     request: FtpRequest
     task: asyncio.Task[None]
 

@@ -283,7 +283,6 @@ class Logs:
     async def _entry(
         self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, max_unanswered: int | None
     ) -> LogEntry:
-        """Return the current entry of a log."""
         log_id = log if isinstance(log, int) else log.id
         # For an id, request the whole list, because the log may not exist. ArduPilot answers the request for a single
         # nonexistent log by an endless list of nonexistent logs.

@@ -81,11 +81,7 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # If both values are equal up to rounding, use the stored one, because the answer may lack the last bits of
-            # a float. Otherwise the store is out of date: another station has just undone our write, and the store has
-            # ignored the message about this (`set_stale`).
-            known = self._access.store.get(name) or answer
-            current[name] = known if same_value(float(known.value), float(answer.value)) else answer
+            current[name] = self._with_all_bits(answer)
             if name not in self._saved:
                 self._saved[name] = current[name]
                 self._registry.add(name, self)
@@ -93,6 +89,13 @@ class _Block:
             if result.name in current:
                 results[result.requested] = result.replace(parameter=current[result.name])
         return results
+
+    def _with_all_bits(self, answer: Parameter) -> Parameter:
+        """Return the stored parameter if it equals the answer, which may lack the last bits of a number."""
+        # Otherwise the store is out of date: another station has just undone our write, and the store has ignored the
+        # message about this (`set_stale`).
+        known = self._access.store.get(answer.name)
+        return known if known is not None and same_value(float(known.value), float(answer.value)) else answer
 
     def _take_saved(self) -> list[Parameter]:
         """End the block, and return the parameters that it must restore."""
