@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.formatting import short_repr
-from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.missions.item import canonical_frame, command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
-from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, Outcome, RunningCommands
+from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, CommandResult, RunningCommands
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,15 +30,6 @@ if TYPE_CHECKING:
     from aerokit.protocols.servers.host import ComponentIds
 
 MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # Two more for a series of pictures and the check of an upload.
-
-
-class CommandResult(Snapshot):
-    """Result of a command handler: a MAV_RESULT, and two numbers whose meaning depends on the command."""
-
-    result: int = MavResult.ACCEPTED.value
-    progress: int = 0
-    detail: int = 0
-    """``result_param2`` of COMMAND_ACK."""
 
 
 @checks_arguments
@@ -96,20 +86,20 @@ class CommandRequest:
         return f"<CommandRequest {command_name(self.command)} from {self.sender.system}/{self.sender.component}>"
 
 
-def outcome_of(value: object) -> Outcome:
+def command_result(value: object) -> CommandResult:
     """Convert the return value of a handler. Raise TypeError if COMMAND_ACK cannot carry it."""
     if value is None or value is True:
-        return Outcome(MavResult.ACCEPTED)
-    outcome = Outcome(MavResult.FAILED)
+        return CommandResult()
+    result = CommandResult(MavResult.FAILED)
     if isinstance(value, CommandResult):
-        outcome = Outcome(value.result, progress=value.progress, detail=value.detail)
+        result = value
     elif isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
-        outcome = Outcome(int(value))
+        result = CommandResult(int(value))
     try:
-        CommandAck(0, *outcome).encode()
+        CommandAck(0, result.result, result.progress, result.detail).encode()
     except InvalidArgument as error:
         raise TypeError(f"the function returned {short_repr(value)}, which is no result: {error}") from None
-    return outcome
+    return result
 
 
 def overrides(driver: object, base: type, name: str) -> bool:
@@ -271,12 +261,12 @@ class _Execution:
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
             self._returned = self._commands.begin(self._function, request, *values)
-            outcome = None if inspect.isawaitable(self._returned) else outcome_of(self._returned)
+            result = None if inspect.isawaitable(self._returned) else command_result(self._returned)
         except Exception as error:
             self._finish_with_error(error)
             return
-        if outcome is not None:
-            self._finish(outcome)
+        if result is not None:
+            self._finish(result)
         elif self._commands._tasks.start(self._run, f"aerokit {command_name(running.command.command)}") is None:
             self.cancel()  # The component is closing.
 
@@ -290,7 +280,7 @@ class _Execution:
             self._is_cancelled = True
             if inspect.iscoroutine(self._returned):
                 self._returned.close()
-            self._finish(Outcome(MavResult.CANCELLED))
+            self._finish(CommandResult(MavResult.CANCELLED))
         return True
 
     async def _run(self) -> None:
@@ -298,14 +288,14 @@ class _Execution:
             return
         self._task = asyncio.current_task()
         try:
-            outcome = outcome_of(await self._returned)
+            result = command_result(await self._returned)
         except asyncio.CancelledError:
-            self._finish(Outcome(MavResult.CANCELLED))
+            self._finish(CommandResult(MavResult.CANCELLED))
             raise
         except Exception as error:
             self._finish_with_error(error)
         else:
-            self._finish(outcome)
+            self._finish(result)
 
     def _report(self, percent: int) -> None:
         if self._commands.uses_threads:  # A thread must not call the event loop's objects directly.
@@ -313,12 +303,12 @@ class _Execution:
         else:
             self._commands._running.report(self._running, percent)
 
-    def _finish(self, outcome: Outcome) -> None:
-        self._commands._running.finish(self._running, outcome)
+    def _finish(self, result: CommandResult) -> None:
+        self._commands._running.finish(self._running, result)
 
     def _finish_with_error(self, error: Exception) -> None:
         name = getattr(self._function, "__name__", "run")
         if name == "run":  # The name of aerokit's own wrapper tells the sender nothing.
             name = command_name(self._running.command.command)
         self._commands._host.report_error(name, error)
-        self._finish(Outcome(result_of(error)))
+        self._finish(CommandResult(result_of(error)))

@@ -11,8 +11,9 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavArmAuthDeniedReason, MavCmd, MavResult, MavSeverity, WinchActions
-from aerokit.onboard.commands import CommandResult, overrides, result_of
+from aerokit.onboard.commands import overrides, result_of
 from aerokit.onboard.host import error_text
+from aerokit.protocols.servers.commands import CommandResult
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandCancel, CommandInt, CommandLong
 from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
@@ -165,19 +166,20 @@ MAX_RESULTS = 256
 """Maximum number of stored results. If there are more, the oldest is forgotten."""
 
 
-class Outcome(NamedTuple):
-    """Result of a command: fields of COMMAND_ACK."""
+class CommandResult(Snapshot):
+    """Result of a command handler: a MAV_RESULT, and two numbers whose meaning depends on the command."""
 
-    result: int
+    result: int = MavResult.ACCEPTED.value
     progress: int = 0
     detail: int = 0
+    """``result_param2`` of COMMAND_ACK."""
 
 
 class EndedCommand(NamedTuple):
     """A command that has ended, and the time of its end."""
 
     command: ReceivedCommand
-    outcome: Outcome
+    result: CommandResult
     ended_at: float
 
 
@@ -228,7 +230,7 @@ class RunningCommands:
         has_result = ended is not None and self._host.now - ended.ended_at <= RESULT_MAX_AGE_S
         # A stop command is executed again, because it may be a new one whose first transmission was lost.
         if ended is not None and has_result and not is_stop and _is_repeated(command, ended.command):
-            self._server.answer(command, *ended.outcome)
+            self._server.answer(command, **ended.result.to_dict())
             return None
         if running is not None and is_stop and self._end_for(running, command):
             running = None
@@ -261,20 +263,20 @@ class RunningCommands:
             self._server.answer(running.command, MavResult.IN_PROGRESS, running.progress)
             self._host.call_later(PROGRESS_INTERVAL_S, lambda: self._report_repeatedly(running))
 
-    def finish(self, running: RunningCommand, outcome: Outcome) -> None:
+    def finish(self, running: RunningCommand, result: CommandResult) -> None:
         command = running.command
         if self._running.get(command.command) is running:
             del self._running[command.command]
-            self._record_result(command, outcome)
-            self._server.answer(command, *outcome)
+            self._record_result(command, result)
+            self._server.answer(command, **result.to_dict())
 
-    def _record_result(self, command: ReceivedCommand, outcome: Outcome) -> None:
+    def _record_result(self, command: ReceivedCommand, result: CommandResult) -> None:
         # Each sender has its own entry, because a repetition may arrive after the same command of another sender.
         key = (command.command, command.sender)
         self._ended.pop(key, None)  # The new entry must be the last one.
         if len(self._ended) >= MAX_RESULTS:
             del self._ended[next(iter(self._ended))]
-        self._ended[key] = EndedCommand(command, outcome, self._host.now)
+        self._ended[key] = EndedCommand(command, result, self._host.now)
 
     def cancel_all(self) -> None:
         for running in tuple(self._running.values()):
