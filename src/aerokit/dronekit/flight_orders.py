@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import anyio
 
@@ -126,11 +126,18 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
         await order.command(command, *params, component_id=0)
 
 
-async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
+class Target(NamedTuple):
+    """Latitude and longitude in degrees times 1e7, and an altitude in metres."""
+
+    latitude_e7: int
+    longitude_e7: int
+    altitude_m: float
+
+
+async def go_to(vehicle: AsyncVehicle, target: Target) -> None:
     """Send DO_REPOSITION or, if it is unsupported, SET_POSITION_TARGET_GLOBAL_INT.
 
-    Latitude and longitude are in 1e-7 degrees. The altitude is in metres, above sea level on PX4, otherwise above
-    home.
+    The altitude is above sea level on PX4, otherwise above home.
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     flags = MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0
@@ -143,9 +150,9 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
                 0,  # default radius
                 math.nan,  # unchanged yaw
                 frame=MavFrame.GLOBAL_INT if is_amsl else MavFrame.GLOBAL_RELATIVE_ALT_INT,
-                x=latitude,
-                y=longitude,
-                z=altitude,
+                x=target.latitude_e7,
+                y=target.longitude_e7,
+                z=target.altitude_m,
                 component_id=0,
             )
         except CommandRejected as error:
@@ -158,7 +165,7 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             set_point = m.SetPositionTargetGlobalInt(
                 time_boot_ms=0, target_system=vehicle.system_id, target_component=0,
                 coordinate_frame=MavFrame.GLOBAL_RELATIVE_ALT_INT, type_mask=POSITION_ONLY,
-                lat_int=latitude, lon_int=longitude, alt=altitude,
+                lat_int=target.latitude_e7, lon_int=target.longitude_e7, alt=target.altitude_m,
                 vx=0.0, vy=0.0, vz=0.0, afx=0.0, afy=0.0, afz=0.0, yaw=0.0, yaw_rate=0.0,
             )  # fmt: skip
             vehicle.send(set_point)
@@ -180,8 +187,7 @@ async def reject(reason: str) -> None:
     raise APIException(reason)
 
 
-def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Return latitude and longitude in 1e-7 degrees, and the altitude in metres."""
+def checked_location(location: LocationGlobal | LocationGlobalRelative) -> Target:
     for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", MAX_FLOAT)):
         value = getattr(location, name)
         try:
@@ -191,7 +197,7 @@ def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple
         if not is_good:
             allowed = "a finite number" if limit == MAX_FLOAT else f"-{limit:g} to {limit:g} degrees"
             raise InvalidArgument(f"location.{name} = {value!r} is not allowed: it must be {allowed}")
-    return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
+    return Target(round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt))
 
 
 def check_speed(name: str, speed: float | None) -> None:

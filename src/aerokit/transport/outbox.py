@@ -7,6 +7,7 @@ import contextlib
 import sys
 from collections import deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 WRITE_TIMEOUT_S = 1.0
 """Seconds after which waiting data is dropped, because a late command is worse than none."""
@@ -16,6 +17,11 @@ STALLED_AFTER_S = 1.0
 
 _POLL_INTERVAL_S = 0.25
 _MAX_JOINED_BYTES = 1024  # Small frames that have waited are combined into writes of up to this size.
+
+
+class _WaitingWrite(NamedTuple):
+    deadline: float
+    data: bytes
 
 
 class Outbox:
@@ -44,7 +50,7 @@ class Outbox:
         self._loop = asyncio.get_running_loop()
         self._send, self._pending, self._limit = send, pending, limit
         self._on_dropped, self._on_stalled = dropped, stalled
-        self._waiting: deque[tuple[float, bytes]] = deque()  # (deadline, frame)
+        self._waiting: deque[_WaitingWrite] = deque()
         self._waiting_bytes = 0
         self._forwarded_bytes = 0  # number of bytes written to the transport
         self._sent_bytes = 0  # number of bytes that had left this machine at the last poll
@@ -114,7 +120,7 @@ class Outbox:
         if self._waiting and self._waiting_bytes + len(data) > self._limit:
             self._on_dropped(1)
             return
-        self._waiting.append((self._loop.time() + WRITE_TIMEOUT_S, data))
+        self._waiting.append(_WaitingWrite(self._loop.time() + WRITE_TIMEOUT_S, data))
         self._waiting_bytes += len(data)
 
     def _forward(self, data: bytes) -> None:
@@ -129,21 +135,18 @@ class Outbox:
     def _take_joined(self) -> bytes:
         """Remove the next write and return it, joined with the writes that follow."""
         joined = self._pop_oldest()
-        while self._waiting:
-            _, next_write = self._waiting[0]
-            if len(joined) + len(next_write) > _MAX_JOINED_BYTES:
-                break
+        while self._waiting and len(joined) + len(self._waiting[0].data) <= _MAX_JOINED_BYTES:
             joined += self._pop_oldest()
         return joined
 
     def _pop_oldest(self) -> bytes:
-        _, data = self._waiting.popleft()
+        data = self._waiting.popleft().data
         self._waiting_bytes -= len(data)
         return data
 
     def _drop_outdated(self) -> None:
         now = self._loop.time()
-        outdated = sum(deadline <= now for deadline, _ in self._waiting)  # The deadlines are in order.
+        outdated = sum(write.deadline <= now for write in self._waiting)  # The deadlines are in order.
         for _ in range(outdated):
             self._pop_oldest()
         if outdated:
