@@ -26,7 +26,8 @@ from aerokit.dronekit.values import (
     Wind,
 )
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import EkfStatusFlags, MavProtocolCapability
+from aerokit.mavlink.enums import EkfStatusFlags as EkfFlags
+from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
@@ -34,12 +35,6 @@ if TYPE_CHECKING:
 
 # Names of MAV_STATE by value.
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
-# Flags of EKF_STATUS_REPORT. ESTIMATOR_STATUS has the same flags.
-POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
-    EkfStatusFlags.POS_HORIZ_ABS.value,
-    EkfStatusFlags.CONST_POS_MODE.value,
-    EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
-)
 FACING_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
 NO_MODE = (None, "INITIALISING", "MAV")  # mode names while the vehicle boots and has no flight mode yet
 GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")
@@ -232,7 +227,7 @@ class VehicleAttributes(VehicleCore):
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         # Like DroneKit, require any fix (2D or better) and a predicted position of the estimator.
         gps = self._dk_gps.message
-        return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
+        return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & EkfFlags.PRED_POS_HORIZ_ABS)
 
     @property
     def version(self) -> Version:
@@ -275,12 +270,11 @@ class VehicleAttributes(VehicleCore):
             self._dk.listeners.announce("rangefinder")
 
     def _dk_on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
-        flags = message.flags
-        self._dk_ekf_flags = flags
+        flags = self._dk_ekf_flags = message.flags  # ESTIMATOR_STATUS has the same flags as EKF_STATUS_REPORT.
         if self._armed:
-            self._dk_ekf_ok = bool(flags & POS_HORIZ_ABS) and not flags & CONST_POS_MODE
+            self._dk_ekf_ok = bool(flags & EkfFlags.POS_HORIZ_ABS) and not flags & EkfFlags.CONST_POS_MODE
         else:
-            self._dk_ekf_ok = bool(flags & (POS_HORIZ_ABS | PRED_POS_HORIZ_ABS))
+            self._dk_ekf_ok = bool(flags & (EkfFlags.POS_HORIZ_ABS | EkfFlags.PRED_POS_HORIZ_ABS))
         self._dk.listeners.notify("ekf_ok", self._dk_ekf_ok, cache=True)
 
     def _dk_on_home(self, message: m.HomePosition) -> None:

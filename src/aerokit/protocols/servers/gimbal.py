@@ -191,6 +191,9 @@ class GimbalRequests:
     def _selects_gimbal(self, device_id: float) -> bool:
         return to_int(device_id) in (0, self._gimbal.device_id)  # 0 selects all gimbals.
 
+    def _may_control(self, sender: ComponentIds, device_id: float) -> bool:
+        return self._selects_gimbal(device_id) and self._gimbal.is_in_control(sender)
+
     def configure(self, command: ReceivedCommand) -> int:
         gimbal, sender = self._gimbal, command.sender
         ids = (command.param1, command.param2, command.param3, command.param4)
@@ -204,7 +207,7 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def pitch_and_yaw(self, command: ReceivedCommand) -> int:
-        if not self._selects_gimbal(command.z) or not self._gimbal.is_in_control(command.sender):
+        if not self._may_control(command.sender, command.z):
             return MavResult.DENIED
         pitch, yaw, pitch_rate, yaw_rate = map(
             math.radians, (command.param1, command.param2, command.param3, command.param4)
@@ -217,8 +220,7 @@ class GimbalRequests:
         """Return the MAV_RESULT that refuses the command, or None."""
         if not self._gimbal.can_point_at_positions:
             return MavResult.UNSUPPORTED
-        is_allowed = self._selects_gimbal(device_id) and self._gimbal.is_in_control(command.sender)
-        return None if is_allowed else MavResult.DENIED
+        return None if self._may_control(command.sender, device_id) else MavResult.DENIED
 
     def look_at(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal
@@ -270,7 +272,7 @@ class GimbalRequests:
         return True
 
     def on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        if self._selects_gimbal(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+        if self._may_control(sender_of(message), message.gimbal_device_id):
             self._apply_attitude(message)
 
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
@@ -286,14 +288,14 @@ class GimbalRequests:
         self.apply(message.flags, (roll, pitch, yaw), rates)
 
     def on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        if self._selects_gimbal(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+        if self._may_control(sender_of(message), message.gimbal_device_id):
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        gimbal = self._gimbal
-        if self._selects_gimbal(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
+        if self._may_control(sender_of(message), message.gimbal_device_id):
             # The angles are taken as radians. The rates are fractions of the slew rate, from -1 to 1.
-            rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
+            slew_rad_s = self._gimbal.slew_rad_s
+            rates = (0.0, message.pitch_rate * slew_rad_s, message.yaw_rate * slew_rad_s)
             self.apply(message.flags, (0.0, message.pitch, message.yaw), rates)
 
 

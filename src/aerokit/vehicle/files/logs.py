@@ -151,8 +151,7 @@ class Logs:
         """
         _check_id(log)
         path, entry = await self._locate(log, method, idle_timeout_s, timeout)
-        listed_entry = entry if isinstance(log, int) else log  # the entry that the caller knows
-        growth = GrowthReporter(listed_entry, on_progress)
+        growth = GrowthReporter(log if isinstance(log, LogEntry) else entry, on_progress)
         if path is not None:
             await self._files.download(
                 path, to, resume=resume, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=growth
@@ -188,8 +187,7 @@ class Logs:
         """
         _check_id(log)
         path, entry = await self._locate(log, method, idle_timeout_s, timeout)
-        listed_entry = entry if isinstance(log, int) else log  # the entry that the caller knows
-        growth = GrowthReporter(listed_entry, on_progress)
+        growth = GrowthReporter(log if isinstance(log, LogEntry) else entry, on_progress)
         if path is not None:
             content = await self._files.read(path, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=growth)
         else:

@@ -317,9 +317,8 @@ class PlanTransfer(Generic[PlanT]):
             self._cache.set(items, self._context.now(), result.opaque_id)
         if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
-        received = await self._read(method)
         try:
-            self._compare(dict(enumerate(items)), dict(enumerate(received)))
+            await self._verify(items, method)
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
@@ -338,9 +337,8 @@ class PlanTransfer(Generic[PlanT]):
         except (FileError, FileTimeout) as error:
             self._on_file_error(error, method)
         else:
-            received = await self._read(method)
             try:
-                self._compare(dict(enumerate(items)), dict(enumerate(received)))
+                await self._verify(items, method)
                 return
             except VerificationFailed:
                 if method == "ftp":
@@ -420,6 +418,9 @@ class PlanTransfer(Generic[PlanT]):
             return False  # The checksum did not arrive in time.
         self._cache.set(items, self._context.now(), checksum)
         return True
+
+    async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
+        self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
 
     def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:
         """Raise VerificationFailed if the items differ. Both mappings are keyed by seq."""

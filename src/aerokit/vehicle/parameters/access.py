@@ -17,7 +17,7 @@ from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S, RoundTrip, is_addressed_to
-from aerokit.vehicle.parameters.store import IN_FLIGHT_S, ParameterStore
+from aerokit.vehicle.parameters.store import IN_FLIGHT_S, ParameterCache, ParameterStore, vehicle_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from aerokit.protocols.exchange import OnProgress
     from aerokit.protocols.parameter_requests import ParameterAnswer
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.parameters.store import ParameterCache
     from aerokit.vehicle.session.transfers import Transfers
 
 DownloadMethod = Literal["auto", "ftp", "list"]
@@ -98,8 +97,6 @@ class ParameterAccess:
                 return self.store.table
             cached_list = None
             if cache is not False and self._transfers.autopilot.has_parameter_hash:
-                from aerokit.vehicle.parameters.store import ParameterCache
-
                 cached_list = _CachedList(self, ParameterCache(None if cache is True else cache), idle_timeout_s)
                 is_loaded = await cached_list.load_if_current(refresh)
                 if is_loaded:
@@ -451,8 +448,6 @@ class _CachedList:
                 self._cache.save(key, self._hash, self._access.store.table)
 
     async def _key(self) -> str:
-        from aerokit.vehicle.parameters.store import vehicle_key
-
         transfers = self._access._transfers
         await transfers.capabilities()
         return vehicle_key(transfers.autopilot.name, transfers.system_id, transfers.version)
