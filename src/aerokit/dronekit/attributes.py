@@ -84,18 +84,18 @@ class Locations(HasObservers, LocationPrivates):
 
     def _on_global_position(self, message: m.GlobalPositionInt) -> None:
         self._has_altitude = self._has_altitude or message.alt != 0
-        self._announce("global_relative_frame")
+        self._notify_frame("global_relative_frame")
         if self._has_altitude:
-            self._announce("global_frame")
-        self._core.listeners.announce("location")
+            self._notify_frame("global_frame")
+        self._core.listeners.notify_attribute("location")
 
     def _on_local_position(self, _: m.LocalPositionNed) -> None:
-        self._announce("local_frame")
-        self._core.listeners.announce("location")
+        self._notify_frame("local_frame")
+        self._core.listeners.notify_attribute("location")
 
-    def _announce(self, frame: str) -> None:
-        self._dk_listeners.announce(frame)
-        self._core.listeners.announce(f"location.{frame}")
+    def _notify_frame(self, frame: str) -> None:
+        self._dk_listeners.notify_attribute(frame)
+        self._core.listeners.notify_attribute(f"location.{frame}")
 
 
 def _position_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]:
@@ -127,15 +127,15 @@ class VehicleAttributes(VehicleCore):
         super().__init__(handler)
         core = self._dk
         self._location = Locations(self)
-        # Core.on() and Core.announce() return a `LatestMessage`.
+        # Core.on() and Core.notify_on() return a `LatestMessage`.
         core.on(m.Heartbeat, self._dk_on_heartbeat)
-        self._dk_position = core.announce(m.GlobalPositionInt, "velocity")
-        self._dk_vfr_hud = core.announce(m.VfrHud, "heading", "airspeed", "groundspeed")
-        self._dk_attitude = core.announce(m.Attitude, "attitude")
-        self._dk_sys_status = core.announce(m.SysStatus, "battery")
-        self._dk_gps = core.announce(m.GpsRawInt, "gps_0")
-        self._dk_wind = core.announce(m.Wind, "wind")
-        self._dk_rangefinder = core.announce(m.Rangefinder, "rangefinder")
+        self._dk_position = core.notify_on(m.GlobalPositionInt, "velocity")
+        self._dk_vfr_hud = core.notify_on(m.VfrHud, "heading", "airspeed", "groundspeed")
+        self._dk_attitude = core.notify_on(m.Attitude, "attitude")
+        self._dk_sys_status = core.notify_on(m.SysStatus, "battery")
+        self._dk_gps = core.notify_on(m.GpsRawInt, "gps_0")
+        self._dk_wind = core.notify_on(m.Wind, "wind")
+        self._dk_rangefinder = core.notify_on(m.Rangefinder, "rangefinder")
         core.on(m.DistanceSensor, self._dk_on_distance_sensor)
         core.on(m.EkfStatusReport, self._dk_on_ekf_status)
         core.on(m.EstimatorStatus, self._dk_on_ekf_status)
@@ -267,7 +267,7 @@ class VehicleAttributes(VehicleCore):
         has_rangefinder_message = self._dk_rangefinder.message is not None  # RANGEFINDER takes precedence.
         if message.orientation == FACING_DOWN and not has_rangefinder_message:
             self._dk_distance_down = message.current_distance / 100.0
-            self._dk.listeners.announce("rangefinder")
+            self._dk.listeners.notify_attribute("rangefinder")
 
     def _dk_on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
         flags = self._dk_ekf_flags = message.flags  # ESTIMATOR_STATUS has the same flags as EKF_STATUS_REPORT.

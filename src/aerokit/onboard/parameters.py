@@ -257,7 +257,7 @@ class _Store:
         return tuple(self._parameters._rows)
 
     @property
-    def small_names(self) -> list[str]:
+    def param_names(self) -> list[str]:
         return self._parameters._numeric_names
 
     def __contains__(self, name: object) -> bool:

@@ -232,7 +232,7 @@ class RunningCommands:
         if ended is not None and has_result and not is_stop and _is_repeated(command, ended.command):
             self._server.answer(command, **ended.result.to_dict())
             return None
-        if running is not None and is_stop and self._end_for(running, command):
+        if running is not None and is_stop and self._cancel_for(running, command):
             running = None
         if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
             self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
@@ -242,7 +242,7 @@ class RunningCommands:
         self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(started))
         return started
 
-    def _end_for(self, running: RunningCommand, command: ReceivedCommand) -> bool:
+    def _cancel_for(self, running: RunningCommand, command: ReceivedCommand) -> bool:
         """Cancel a running command, because ``command`` stops it. Return False if it cannot be cancelled."""
         del self._running[command.command]
         if not running.cancel():

@@ -133,7 +133,7 @@ class TypedStore(NamedList, Protocol):
     """Typed parameters of a component."""
 
     @property
-    def small_names(self) -> Sequence[str]:
+    def param_names(self) -> Sequence[str]:
         """Names of the parameters whose values fit into PARAM_VALUE.
 
         This must be fast, because every PARAM_VALUE needs it.
@@ -167,7 +167,7 @@ class TypedParameterServer(ParameterProtocolServer):
 
     @property
     def names(self) -> Sequence[str]:
-        return self._store.small_names
+        return self._store.param_names
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
         value, type_ = self._store[name], ParameterType(self._store.type(name))
