@@ -172,14 +172,14 @@ class Captures:
         self._is_exposing = False  # True while an image is being taken
         self._is_late = False  # True if the next image is due, but the previous one is not finished
         self._series = 0  # number of the series; callbacks of earlier series are ignored
-        self._recording_since = math.nan  # start of the video; NaN while there is no video
+        self._recording_since: float | None = None  # start of the video; None while there is no video
 
     def switch_off(self) -> None:
         """End the series and the video at once, as a power failure does. The image log is kept."""
         self._remaining = 0
         self._is_exposing = False
         self._is_late = False
-        self._recording_since = math.nan
+        self._recording_since = None
         self._series += 1
 
     @property
@@ -188,7 +188,7 @@ class Captures:
 
     @property
     def is_recording(self) -> bool:
-        return not math.isnan(self._recording_since)
+        return self._recording_since is not None
 
     def take(self) -> None:
         self.take_series(interval_s=0.0, count=1)
@@ -273,11 +273,13 @@ class Captures:
 
         The length is 0 if no video was being recorded.
         """
-        if not self.is_recording:
-            return 0.0
-        seconds = self._camera.host.now - self._recording_since
-        self._recording_since = math.nan
+        seconds = self._recording_s
+        self._recording_since = None
         return seconds
+
+    @property
+    def _recording_s(self) -> float:
+        return 0.0 if self._recording_since is None else self._camera.host.now - self._recording_since
 
     def _send_status_every(self, recording: float, interval_s: float) -> None:
         def send_status() -> None:
@@ -294,10 +296,9 @@ class Captures:
             image_status = _WAITING_AND_CAPTURING if self._is_exposing else _WAITING
         else:
             image_status = _CAPTURING if self._is_exposing else _IDLE
-        recording_s = camera.host.now - self._recording_since if self.is_recording else 0.0
         return CameraCaptureStatus(
             time_boot_ms=camera.host.time_boot_ms, image_status=image_status, video_status=int(self.is_recording),
-            image_interval=self.interval_s if is_series else 0.0, recording_time_ms=round(recording_s * 1000),
+            image_interval=self.interval_s if is_series else 0.0, recording_time_ms=round(self._recording_s * 1000),
             available_capacity=camera.free_mib, image_count=self.image_count,
         )  # fmt: skip
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Literal
@@ -17,7 +16,7 @@ from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S, RoundTrip, is_addressed_to
-from aerokit.vehicle.parameters.store import IN_FLIGHT_S, ParameterCache, ParameterStore, vehicle_key
+from aerokit.vehicle.parameters.store import STALE_VALUE_S, ParameterCache, ParameterStore, vehicle_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -38,12 +37,12 @@ ANSWER_DELAY_S = 0.1
 # Value of SET_MESSAGE_INTERVAL that restores the autopilot's default rate.
 DEFAULT_INTERVAL = 0
 # Seconds after a write in which late or repeated answers to it may arrive.
-ECHO_WINDOW_S = 3.0
+LATE_ANSWER_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
-MAX_READS_UNBOOSTED = 5
+MAX_READS_AT_DEFAULT_RATE = 5
 # Reading a few parameters raises ArduPilot's rate of answers after this many seconds. By then, the vehicle probably
 # lacks a parameter, whose request must be repeated.
-BOOST_DELAY_S = 0.5
+RAISE_DELAY_S = 0.5
 # Fewer changes than this are set one by one. A file would not be faster, and the vehicle confirms each value.
 MIN_CHANGES_FOR_FILE = 10
 # If more values than this must be read back, the whole list is downloaded instead.
@@ -61,7 +60,7 @@ class ParameterAccess:
         self._write_lock = asyncio.Lock()
         self._has_file: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
         self._cached_read_round_trip: RoundTrip | None = None  # see `_read_round_trip`
-        self._boosts = 0  # number of running operations that need a raised rate of answers
+        self._rate_users = 0  # number of running operations that need a raised rate of answers
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
         # Last value of each parameter that this program has written; None until the vehicle confirms the value.
         self.written: dict[str, int | float | None] = {}
@@ -203,7 +202,7 @@ class ParameterAccess:
             on_progress=on_progress,
         )
         updates_before = self.store.updates
-        with self._boosted():
+        with self._raised_rate():
             table = await transfers.run(exchange)
         self.store.replace(self._with_known_defaults(table), updates_before=updates_before)
 
@@ -231,13 +230,13 @@ class ParameterAccess:
             round_trip=self._read_round_trip,
             idle_timeout_s=idle_timeout_s,
         )
-        if len(names) > MAX_READS_UNBOOSTED:
-            boost_after_s = 0.0
+        if len(names) > MAX_READS_AT_DEFAULT_RATE:
+            raise_after_s: float | None = 0.0
         elif probe:  # A missing parameter is requested several times.
-            boost_after_s = BOOST_DELAY_S
+            raise_after_s = RAISE_DELAY_S
         else:
-            boost_after_s = math.inf
-        with self._boosted(after_s=boost_after_s):
+            raise_after_s = None
+        with self._raised_rate(raise_after_s):
             return await transfers.run(exchange)
 
     def _read_later(self, name: str, time: float) -> None:
@@ -255,30 +254,33 @@ class ParameterAccess:
             self._transfers.background.start(read, f"aerokit read of {name}")
 
     @contextmanager
-    def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
-        """Raise the rate at which ArduPilot handles parameters, from ``after_s`` seconds on until the block ends."""
+    def _raised_rate(self, after_s: float | None = 0.0) -> Iterator[None]:
+        """Raise the rate at which ArduPilot handles parameters, from ``after_s`` seconds on until the block ends.
+
+        None leaves the rate unchanged.
+        """
         interval_s = self._transfers.autopilot.parameter_interval_s
-        if interval_s is None or after_s == math.inf:
+        if interval_s is None or after_s is None:
             yield
             return
-        is_boosted = False
+        is_raised = False
 
-        def boost() -> None:
-            nonlocal is_boosted
-            is_boosted = True
-            self._boosts += 1
-            if self._boosts == 1:
+        def raise_rate() -> None:
+            nonlocal is_raised
+            is_raised = True
+            self._rate_users += 1
+            if self._rate_users == 1:
                 # ArduPilot handles parameters at the rate of the message PARAM_VALUE.
                 self._set_interval(interval_s * 1e6)  # microseconds
 
-        timer = asyncio.get_running_loop().call_later(after_s, boost)
+        timer = asyncio.get_running_loop().call_later(after_s, raise_rate)
         try:
             yield
         finally:
             timer.cancel()
-            if is_boosted:
-                self._boosts -= 1
-                if not self._boosts:
+            if is_raised:
+                self._rate_users -= 1
+                if not self._rate_users:
                     self._set_interval(DEFAULT_INTERVAL)
 
     def _set_interval(self, interval_us: float) -> None:
@@ -317,9 +319,9 @@ class ParameterAccess:
             on_progress=on_progress,
         )
         # Many reads need the raised rate.
-        boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
+        raise_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
         try:
-            with self._boosted(after_s=boost_after_s):
+            with self._raised_rate(raise_after_s):
                 answers = await transfers.run(exchange)
         finally:
             # Answers to a write that was cancelled or failed may also arrive late.
@@ -334,7 +336,7 @@ class ParameterAccess:
             stored = self.store.get(name)
             if stored is not None and not same_value(stored.value, answer.value):
                 # Another value arrived after the answer. It may be a late answer, so the parameter is read again.
-                self._read_later(name, transfers.connection.now() + IN_FLIGHT_S)
+                self._read_later(name, transfers.connection.now() + STALE_VALUE_S)
         return answers
 
     def is_in_doubt(self, name: str) -> bool:
@@ -356,7 +358,7 @@ class ParameterAccess:
     def _recently_written(self) -> set[str]:
         # A late answer to the last write of these parameters could be taken for the answer to their next write. The
         # next write is therefore verified by a read.
-        earliest = self._transfers.connection.now() - ECHO_WINDOW_S
+        earliest = self._transfers.connection.now() - LATE_ANSWER_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
 

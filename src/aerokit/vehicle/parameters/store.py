@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.transfers import Transfers
 
 # Seconds in which messages with the previous value may still arrive after a write.
-IN_FLIGHT_S = 1.0
+STALE_VALUE_S = 1.0
 
 
 class StaleValue(NamedTuple):
@@ -74,11 +74,11 @@ class ParameterStore:
         return name in self._known
 
     def set_stale(self, name: str, value: float) -> None:
-        """Ignore messages with the old value for ``IN_FLIGHT_S`` seconds after a write."""
+        """Ignore messages with the old value for ``STALE_VALUE_S`` seconds after a write."""
         # ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
         # value. An answer with the old value may therefore arrive after the confirmation of the write. But another
         # station may also have restored the old value. The parameter is therefore read after each ignored message.
-        self._stale[name] = StaleValue(value, self._transfers.connection.now() + IN_FLIGHT_S)
+        self._stale[name] = StaleValue(value, self._transfers.connection.now() + STALE_VALUE_S)
 
     def clear_stale(self, name: str) -> None:
         """Undo `set_stale` before a new write, which may set the parameter to the same value again."""
