@@ -34,8 +34,8 @@ class Outbox:
         send: writes bytes to the transport.
         pending: returns the number of unsent bytes in the transport and the kernel.
         limit: maximum number of buffered bytes.
-        dropped: called with the number of dropped writes.
-        stalled: called with True when no waiting data has left for `STALLED_AFTER_S`, with False when it leaves again.
+        on_dropped: called with the number of dropped writes.
+        on_stalled: called with True when waiting data stays for `STALLED_AFTER_S`, with False when it leaves again.
     """
 
     def __init__(
@@ -44,12 +44,12 @@ class Outbox:
         pending: Callable[[], int],
         *,
         limit: int,
-        dropped: Callable[[int], object],
-        stalled: Callable[[bool], object],
+        on_dropped: Callable[[int], object],
+        on_stalled: Callable[[bool], object],
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._send, self._pending, self._limit = send, pending, limit
-        self._on_dropped, self._on_stalled = dropped, stalled
+        self._on_dropped, self._on_stalled = on_dropped, on_stalled
         self._waiting: deque[_WaitingWrite] = deque()
         self._waiting_bytes = 0
         self._forwarded_bytes = 0  # number of bytes written to the transport
@@ -104,7 +104,7 @@ class Outbox:
         self._forwarded_bytes -= count
 
     def close(self) -> None:
-        """Forward waiting data, or drop it if the transport is stalled. Afterwards, ``stalled`` is not called."""
+        """Forward waiting data, or drop it if the transport is stalled. Afterwards, ``on_stalled`` is not called."""
         if self._is_closed:
             return
         self._is_closed = True

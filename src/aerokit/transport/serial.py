@@ -102,8 +102,8 @@ class SerialLink(BaseLink):
             self._transport.write,
             partial(self._waiting_to_be_sent, self._transport),
             limit=limit,
-            dropped=self._drop,
-            stalled=self._report_stalled,
+            on_dropped=self._drop,
+            on_stalled=self._report_stalled,
         )
 
     def _open_port(self) -> tuple[Any, Any]:

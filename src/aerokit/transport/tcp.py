@@ -346,8 +346,8 @@ class _Stream(asyncio.Protocol):
             transport.write,
             self._pending,
             limit=MAX_PENDING_BYTES,
-            dropped=self._link._drop,
-            stalled=lambda is_stalled: self._link._on_stalled(self, is_stalled),
+            on_dropped=self._link._drop,
+            on_stalled=lambda is_stalled: self._link._on_stalled(self, is_stalled),
         )
         self._link._add_stream(self)
 
