@@ -260,11 +260,11 @@ async def test_copies_of_second_sender_prove_no_link(is_first_used: bool, is_sec
         ours, theirs = FrameEncoder(1, 1), FrameEncoder(1, 1)
         peers = {0: ("127.0.0.1", 9), 1: ("127.0.0.2", 9)}
         for index, encoder in ((0, ours), (1, theirs)):
-            link._on_bytes(index, encoder.encode(AUTOPILOT), peers[index])
+            link._members[index].bytes_received(encoder.encode(AUTOPILOT), peers[index])
         for step in range(MIN_COPIES):
             data = theirs.encode(m.Attitude(10_000 + step, *(0.0,) * 6))
             for index in (0, 1) if is_first_used else (1, 0):
-                link._on_bytes(index, data, peers[1 if is_second_sender else index])
+                link._members[index].bytes_received(data, peers[1 if is_second_sender else index])
         assert bool(candidates_of(connection)[1].is_same_vehicle) is not is_second_sender
 
 
@@ -276,12 +276,12 @@ async def test_hardware_id_relayed_by_second_sender_proves_no_link() -> None:
         ours, theirs = FrameEncoder(1, 1), FrameEncoder(1, 1)
         peers = {0: ("127.0.0.1", 9), 1: ("127.0.0.2", 9)}
         for index, encoder, uid in ((0, ours, b"A" * 18), (1, theirs, b"B" * 18)):
-            link._on_bytes(index, encoder.encode(AUTOPILOT), peers[index])
-            link._on_bytes(index, encoder.encode(version(uid)), peers[index])
+            link._members[index].bytes_received(encoder.encode(AUTOPILOT), peers[index])
+            link._members[index].bytes_received(encoder.encode(version(uid)), peers[index])
         assert candidates_of(connection)[1].is_other_hardware
         data = ours.encode(version(b"A" * 18))
         for index in (0, 1):
-            link._on_bytes(index, data, peers[0])
+            link._members[index].bytes_received(data, peers[0])
         assert candidates_of(connection)[1].is_other_hardware
 
 
@@ -520,7 +520,7 @@ async def test_peer_is_named_as_by_its_member_link() -> None:
                 said.append(f"127.0.0.1:{here.getsockname()[1]}")
                 encoder = FrameEncoder(1, 1)
                 for _ in range(4):
-                    link._on_bytes(1, encoder.encode(AUTOPILOT), here.getsockname())
+                    link._members[1].bytes_received(encoder.encode(AUTOPILOT), here.getsockname())
                     await anyio.sleep(0.1)
             if round_ == 0:
                 await anyio.sleep(4)

@@ -98,7 +98,7 @@ class StateCell(Generic[T]):
         self._updated_at = -math.inf
         self._arrivals = 0  # number of values set so far
         self._changes = 0  # number of values that differed from the value before
-        # Waiters and observers. Changes replace the tuple, because a listener that is called may add or remove listeners.
+        # Waiters and observers. Changes replace the tuple, because a called listener may add or remove listeners.
         self._listeners: tuple[_Listener[T], ...] = ()
         self._iterator_count = 0
         self._feeds: tuple[Feed, ...] = ()  # decode pending messages before the cell is read

@@ -109,12 +109,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
     def in_order_of_index(self) -> ParameterTable:
         """Return a copy sorted by index. Parameters without an index come last."""
-
-        def sort_key(parameter: Parameter) -> int:
-            above_all_indices = 1 << 16  # Indices have 16 bits.
-            return above_all_indices if parameter.index is None else parameter.index
-
-        return ParameterTable(sorted(self._by_name.values(), key=sort_key))
+        return ParameterTable(sorted(self._by_name.values(), key=lambda param: (param.index is None, param.index or 0)))
 
 
 def _merged(old: Parameter | None, new: Parameter) -> Parameter:

@@ -13,6 +13,7 @@ from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.pack import HASH_NAME, px4_hash
 from aerokit.protocols.servers import parameters as servers
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.sim.channel import Channel
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import SimulatedVehicle, sender_of
@@ -215,6 +216,6 @@ class Px4ParameterServer(ParameterServer):
             return MavParamError.TYPE_UNSUPPORTED
         return None if type_ == self._parameters.type(name) else MavParamError.TYPE_MISMATCH
 
-    def _refuse(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
+    def _refuse(self, to: ComponentIds, name: str, index: int, code: int, channel: Channel) -> None:
         if self.sends_errors:
             self.send_error(to, name, index, code, channel)

@@ -158,7 +158,7 @@ async def turn_east(vehicle: Vehicle) -> None:
 async def go_to_as_dronekit(vehicle: Vehicle) -> None:
     home = vehicle.home.value
     latitude, longitude = round(home.latitude_deg * 1e7), round(home.longitude_deg * 1e7)
-    await flight_orders.go_to(vehicle, latitude, longitude, home.altitude_amsl_m + 10.0)
+    await flight_orders.go_to(vehicle, flight_orders.Target(latitude, longitude, home.altitude_amsl_m + 10.0))
 
 
 @pytest.mark.parametrize("order", [go_to_10_m_north, turn_east, go_to_as_dronekit])

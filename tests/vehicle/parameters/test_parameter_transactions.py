@@ -98,6 +98,23 @@ async def test_value_changed_by_program_is_restored() -> None:
         assert values(flight) == BEFORE
 
 
+async def test_value_written_by_other_task_during_restore_is_restored(caplog: pytest.LogCaptureFixture) -> None:
+    """The other task writes while the block reads the present value."""
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        parameters = flight.vehicle.parameters
+        on_read = flight.copter.handlers[messages.ParamRequestRead.ID]
+
+        def write_and_answer(message: messages.ParamRequestRead, channel: Any) -> None:
+            flight.copter.handlers[messages.ParamRequestRead.ID] = on_read
+            tasks.start_soon(parameters.set, "RTL_ALT", 2500)
+            on_read(message, channel)
+
+        async with parameters.temporarily({"RTL_ALT": 2000}):
+            flight.copter.handlers[messages.ParamRequestRead.ID] = write_and_answer
+        assert "another station" not in caplog.text
+        assert flight.copter.parameters["RTL_ALT"] == 1500.0
+
+
 async def test_value_of_cancelled_upload_is_restored() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters

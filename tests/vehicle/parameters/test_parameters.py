@@ -32,7 +32,7 @@ from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink
 from aerokit.vehicle.connect import connect
 from aerokit.vehicle.files.files import Files
-from aerokit.vehicle.parameters.access import MAX_READ_BACK, MIN_PACK_SIZE
+from aerokit.vehicle.parameters.access import MAX_READ_BACK, MIN_CHANGES_FOR_FILE
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.store import ParameterCache, default_directory
 from aerokit.vehicle.parameters.writing import ResolvedParameter, resolve_known
@@ -670,7 +670,7 @@ async def test_refused_upload_file_raises_or_falls_back(monkeypatch: pytest.Monk
 
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
-        names = list(await parameters.download())[:MIN_PACK_SIZE]
+        names = list(await parameters.download())[:MIN_CHANGES_FOR_FILE]
         monkeypatch.setattr(Files, "write", refused)
         wanted = dict.fromkeys(names, 1)
         if method == "ftp":

@@ -15,6 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType, MavSeverity
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
@@ -30,7 +31,7 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.mission_items import as_downloaded, as_stored, checksum
 from aerokit.sim.vehicle import sender_of
 
-_NO_PARTNER = (0, 0)
+_NO_PARTNER = ComponentIds()
 _CAPACITIES: dict[int, int] = {MavMissionType.MISSION: 10_000, MavMissionType.FENCE: 64, MavMissionType.RALLY: 32}
 
 
@@ -127,7 +128,7 @@ class Px4MissionServer(MissionServer):
     def _warn(self, text: str) -> None:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
-    def _answer(self, link: _Link, result: int, to: tuple[int, int] | None = None) -> None:
+    def _answer(self, link: _Link, result: int, to: ComponentIds | None = None) -> None:
         self._acknowledge(to or link.client, link.mission_type, result, link.channel)
 
     def _begin_transfer(self, state: TransferState, message: AnyListMessage, channel: Channel, count: int) -> _Link:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import anyio
 
@@ -68,6 +68,13 @@ class PlanCache:
         self.changes += 1
 
 
+class PlanVersion(NamedTuple):
+    """Value that changes whenever this program notices a change of the vehicle's plan."""
+
+    changes: int  # also counts the plans of other stations on a shared link
+    plan_id: int  # the vehicle's id; 0 except on PX4
+
+
 class PlanContext:
     """State shared by the mission, the fence and the rally points of one vehicle.
 
@@ -118,11 +125,9 @@ class PlanContext:
         ids_by_mission_type = (current.mission_id, current.fence_id, current.rally_points_id)
         return ids_by_mission_type[mission_type]
 
-    def version(self, mission_type: int) -> tuple[int, int]:
-        """Return a value that changes whenever this program notices a change of the vehicle's plan."""
+    def version(self, mission_type: int) -> PlanVersion:
         cache = self.caches[mission_type]
-        # `changes` also counts the plans of other stations on a shared link. Only PX4 has a plan id other than 0.
-        return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
+        return PlanVersion(cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id)
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
         received, started_at = asyncio.Event(), self.now()

@@ -81,11 +81,7 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # If both values are equal up to rounding, use the stored one, because the answer may lack the last bits of
-            # a float. Otherwise the store is out of date: another station has just undone our write, and the store has
-            # ignored the message about this (`mark_replaced`).
-            known = self._access.store.get(name) or answer
-            current[name] = known if same_value(float(known.value), float(answer.value)) else answer
+            current[name] = self._with_all_bits(answer)
             if name not in self._saved:
                 self._saved[name] = current[name]
                 self._registry.add(name, self)
@@ -93,6 +89,13 @@ class _Block:
             if result.name in current:
                 results[result.requested] = result.replace(parameter=current[result.name])
         return results
+
+    def _with_all_bits(self, answer: Parameter) -> Parameter:
+        """Return the stored parameter if it equals the answer, which may lack the last bits of a number."""
+        # Otherwise the store is out of date: another station has just undone our write, and the store has ignored the
+        # message about this (`set_stale`).
+        known = self._access.store.get(answer.name)
+        return known if known is not None and same_value(float(known.value), float(answer.value)) else answer
 
     def _take_saved(self) -> list[Parameter]:
         """End the block, and return the parameters that it must restore."""
@@ -124,10 +127,11 @@ class _Block:
         reason = ""
         with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
             try:
-                unreadable, changed = await self._unreadable_and_changed(saved)
+                names = [param.name for param in saved if self._access.written.get(param.name) is not None]
+                present = await self._access.read(names, self._idle_timeout_s)
                 # Keep values that another station has set. Parameters that cannot be read count as not restored.
-                saved = [param for param in saved if param.name not in changed]
-                to_write = [param for param in saved if param.name not in unreadable]
+                saved = [param for param in saved if not self._was_changed(param.name, present.get(param.name))]
+                to_write = [param for param in saved if isinstance(present.get(param.name, param), Parameter)]
                 answers = await self._access.write(to_write, self._idle_timeout_s)
             except AerokitError as error:
                 reason = f" ({error})"
@@ -141,19 +145,14 @@ class _Block:
             raise error
         _raise_not_restored(self._take_saved(), f" ({error})", cause)
 
-    async def _unreadable_and_changed(self, saved: list[Parameter]) -> tuple[set[str], set[str]]:
-        """Return the names that cannot be read, and those that another station has changed."""
-        written = self._access.written
-        names = [param.name for param in saved if param.name in written]
-        unreadable, changed = set[str](), set[str]()
-        for name, answer in (await self._access.read(names, self._idle_timeout_s)).items():
-            if not isinstance(answer, Parameter):
-                unreadable.add(name)
-            elif float(answer.value) != float(written[name]):
-                changed.add(name)
-                text = "%s is not restored: another station has changed it from %r to %r"
-                logger.warning(text, name, written[name], answer.value)
-        return unreadable, changed
+    def _was_changed(self, name: str, present: object) -> bool:
+        """Return True, and log a warning, if another station has changed the parameter."""
+        written = self._access.written.get(name)  # None if another task of this program is writing the parameter
+        if not isinstance(present, Parameter) or written is None or float(present.value) == float(written):
+            return False
+        text = "%s is not restored: another station has changed it from %r to %r"
+        logger.warning(text, name, written, present.value)
+        return True
 
 
 class TemporaryParameters(_Block):
