@@ -643,6 +643,19 @@ async def test_disarming_ends_wait_finished() -> None:
                 await flight.vehicle.mission.wait_finished()
 
 
+async def test_disarming_on_a_slope_does_not_finish_mission() -> None:
+    """The vehicle stands on a hill, and the autopilot's crash check disarms it on its way to the last waypoint."""
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission, motion = flight.vehicle.mission, flight.copter.motion
+        await mission.start()
+        await reaches(flight, mission.count.value - 1)
+        motion.ground_down = motion.down
+        asyncio.get_running_loop().call_later(2.0, flight.copter.arming.disarm)
+        with pytest.raises(OperationRejected, match=r"the mission has not ended \(at item \d of"):
+            await mission.wait_finished(timeout=60)
+
+
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
 async def test_mission_that_ends_in_a_fall_is_not_finished(opened: Any) -> None:
     """The vehicle disarms during the landing or the return at its end."""
