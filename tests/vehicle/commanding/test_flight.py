@@ -855,7 +855,7 @@ async def test_set_home_without_requested_message_succeeds(flying: Flight, name:
     getattr(flying.copter.faults, name)(MavCmd.REQUEST_MESSAGE)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(flying.vehicle.set_home)
-        await anyio.sleep(6.0)
+        await anyio.sleep(4.0)
         flying.copter.send_built(m.HomePosition.ID)
 
 
@@ -874,6 +874,12 @@ async def test_set_home_waits_for_report_of_new_home(flying: Flight) -> None:
         await anyio.sleep(1.0)
         copter.send_built(m.HomePosition.ID)
     assert flying.vehicle.home.value.position.distance_to(place) < 0.1
+
+
+async def test_set_home_requests_lost_report_again(flying: Flight) -> None:
+    flying.copter.faults.lose(m.HomePosition, times=3)
+    await flying.vehicle.set_home()
+    assert flying.copter.faults.lost_messages[m.HomePosition.ID] == 0
 
 
 async def test_set_home_reports_home_that_stays(flying: Flight, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import (
+    AerokitError,
     CommandRejected,
     CommandTimeout,
     InvalidArgument,
@@ -378,17 +379,26 @@ class TravelActions(VehicleBase):
                 position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
                 send = self._session.commands.send_place
                 await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
-        requested_at = self.connection.now()
-        # The vehicle has moved its home. Most vehicles then send HOME_POSITION without a request.
-        with suppress(CommandRejected, CommandTimeout):
-            await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
+        acknowledged_at = self.connection.now()
 
         def is_set(reported: Home) -> bool:
             # A message with the old home may arrive after the acknowledgement.
             is_there = place is None or reported.position.distance_to(place) <= HOME_TOLERANCE_M
-            return is_there and home.updated_at >= requested_at
+            return is_there and home.updated_at >= acknowledged_at
 
-        await home.wait_until(is_set, timeout=timeout, description="set_home")
+        # Most vehicles send HOME_POSITION once when their home has moved, and this message may be lost.
+        task = self._session.background.start(self._request_home, "aerokit request of the home position")
+        try:
+            await home.wait_until(is_set, timeout=timeout, description="set_home")
+        finally:
+            if task is not None:
+                task.cancel()
+
+    async def _request_home(self) -> None:
+        with suppress(AerokitError):
+            while True:
+                await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
+                await anyio.sleep(RESEND_INTERVAL_S)
 
     def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres; infinite while the position is unknown.
