@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import anyio
@@ -874,6 +875,18 @@ async def test_set_home_waits_for_report_of_new_home(flying: Flight) -> None:
         await anyio.sleep(1.0)
         copter.send_built(m.HomePosition.ID)
     assert flying.vehicle.home.value.position.distance_to(place) < 0.1
+
+
+async def test_take_off_reaches_its_altitude_when_home_is_moved(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(partial(vehicle.take_off, 10.0, timeout=30.0))
+        await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0.0) > 5.0)
+        await vehicle.set_home()
+    assert -grounded.copter.motion.down == pytest.approx(10.0, abs=0.6)
+    assert (vehicle.position.value.altitude_relative_m or 0.0) < 6.0
 
 
 async def test_set_home_requests_lost_report_again(flying: Flight) -> None:
