@@ -124,7 +124,7 @@ async def test_lost_hardware_request_is_repeated() -> None:
 
     twins.radios.links[1].link.write = lose_two  # type: ignore[method-assign]
     async with twins.connected() as connection:
-        proven: list[bool] = []
+        proven: list[bool | None] = []
         async with aerokit.connect(connection) as flying:
             await flying.wait_ready()
             for _ in range(60):

@@ -4995,7 +4995,9 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait for the next HOME_POSITION after the acknowledgement.
+        """Move the home position, and wait until HOME_POSITION reports it after the acknowledgement.
+
+        While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
         COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
@@ -5009,7 +5011,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: the vehicle accepted the command, but no HOME_POSITION was received.
+            OperationTimeout: the vehicle accepted the command, but HOME_POSITION did not report the new home.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 

@@ -201,13 +201,14 @@ class CopterGuided(CopterModeBase):
             # velocity.
             offsets = (target - current for target, current in zip(self.position, motion.place, strict=True))
             north, east, down = (speed + offset for speed, offset in zip(self.velocity, offsets, strict=True))
-            self._seek_velocity(north, east, down)
+            self._seek_velocity(north, east, down, acceleration=self.acceleration)
 
-    def _seek_velocity(self, north: float, east: float, down: float) -> None:
+    def _seek_velocity(self, north: float, east: float, down: float, *, acceleration: Ned = _ZERO) -> None:
         horizontal_speed = math.hypot(north, east)
         if horizontal_speed > self.speed:
             north, east = north * self.speed / horizontal_speed, east * self.speed / horizontal_speed
-        self.vehicle.motion.seek_velocity(north, east, max(-self.climb, min(self.descent, down)))
+        down = max(-self.climb, min(self.descent, down))
+        self.vehicle.motion.follow_trajectory((north, east, down), acceleration)
 
 
 _BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})

@@ -25,6 +25,7 @@ from aerokit.vehicle.commanding.arbiter import STEERING
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
+from aerokit.vehicle.commanding.sender import DISARM_REPORT_TIMEOUT_S
 from aerokit.vehicle.state.status_text import CHUNK_LENGTH
 
 if TYPE_CHECKING:
@@ -246,14 +247,16 @@ class ArmingActions(VehicleBase):
         """
         self._arm_cleanup.stop()
         started = self.connection.now()
+        report_timeout_s = min(timeout, DISARM_REPORT_TIMEOUT_S)
         with self._arbiter.auxiliary_order(ends_flight=True) as order:
             try:
-                await self._sender.send_arm(order, armed=False, force=force)
+                await self._sender.send_disarm(order, force=force, report_timeout_s=report_timeout_s)
             except CommandRejected as error:
                 # ArduCopter sends no status text when it refuses to disarm in the air (AP_Arming_Copter.cpp, disarm).
                 raise self._session.with_reasons(error, started, self._reason_if_flying()) from None
+            remaining_s = timeout - report_timeout_s
             await self._await_armed(
-                armed=False, order=order, started=started, timeout=timeout, max_silence_s=max_silence_s
+                armed=False, order=order, started=started, timeout=remaining_s, max_silence_s=max_silence_s
             )
 
     def _reason_if_flying(self) -> tuple[str, ...]:

@@ -356,7 +356,7 @@ class ArmCleanup:
         with anyio.CancelScope(shield=True):
             try:
                 with self._arbiter.auxiliary_order(ends_flight=True) as disarm_order:
-                    await self._sender.send_arm(disarm_order, armed=False)
+                    await self._sender.send_disarm(disarm_order)
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 

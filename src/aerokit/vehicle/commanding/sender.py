@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
 from aerokit._internal.arguments import check_range
-from aerokit.errors import CommandRejected, CommandTimeout, HeartbeatTimeout, NotSupported, OperationRejected
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    HeartbeatTimeout,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, allowed_attempts, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
@@ -28,6 +35,8 @@ if TYPE_CHECKING:
 
 FORCE = 21196
 """param2 of COMPONENT_ARM_DISARM that skips the pre-arm checks."""
+DISARM_REPORT_TIMEOUT_S = 2.5
+"""HEARTBEAT reports disarmed within this many seconds after a command to disarm, even if two of them are lost."""
 ACCEPTANCE_REVOKED = "the vehicle accepted the command and then refused it"
 
 
@@ -143,6 +152,24 @@ class OrderSender:
         self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
         params = (float(armed), FORCE if force else 0)
         await self.send_long(order, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
+
+    async def send_disarm(
+        self, order: Order, *, force: bool = False, report_timeout_s: float = DISARM_REPORT_TIMEOUT_S
+    ) -> None:
+        """Send the command to disarm, and once more if HEARTBEAT still reports armed after ``report_timeout_s``.
+
+        A link that duplicates frames makes the vehicle answer twice, and the second answer to a command to arm looks
+        like an answer to this command.
+        """
+        armed, started = self._session.telemetry.armed, self._session.connection.now()
+        await self.send_arm(order, armed=False, force=force)
+        with suppress(OperationTimeout):
+            await armed.wait_until(
+                lambda is_armed: not is_armed and armed.updated_at > started, timeout=report_timeout_s
+            )
+            return
+        if not order.end and self._arbiter.is_state_recent:
+            await self.send_arm(order, armed=False, force=force)
 
     # ----------------------------------------------------------------------------------- modes
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import anyio
 
@@ -14,6 +14,7 @@ from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
+from aerokit.vehicle.missions.context import LANDING_PURPOSES
 from aerokit.vehicle.missions.plans import VehiclePlan
 from aerokit.vehicle.missions.stalling import MissionStallDetector
 from aerokit.vehicle.state.telemetry import is_reported_on_ground
@@ -33,13 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# Maps commands that land the vehicle at the end of a mission to the mode in which it may do so.
-LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
-    MavCmd.NAV_RETURN_TO_LAUNCH: "return",
-    MavCmd.NAV_LAND: "land",
-    MavCmd.NAV_VTOL_LAND: "land",
-}
-
 # Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 

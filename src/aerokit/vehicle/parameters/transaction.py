@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
@@ -35,6 +36,9 @@ class RestoreRegistry:
 
     def __init__(self) -> None:
         self._blocks: dict[str, list[_Block]] = {}
+        # Held while a block saves or restores values: a block that begins while another one restores its parameters
+        # would save, and later restore, temporary values.
+        self.lock: asyncio.Lock = asyncio.Lock()
 
     def add(self, name: str, block: _Block) -> None:
         self._blocks.setdefault(name, []).append(block)
@@ -69,6 +73,12 @@ class _Block:
         """Resolve names, and save the parameters as they are before their first write."""
         # The writer calls this method before each round of writes, because some parameters appear only after the first
         # round.
+        async with self._registry.lock:
+            return await self._resolve_and_save_locked(names, idle_timeout_s)
+
+    async def _resolve_and_save_locked(
+        self, names: Iterable[str], idle_timeout_s: float
+    ) -> dict[str, ResolvedParameter | ParameterFailure]:
         results = await self._writer.names.resolve(names, idle_timeout_s)
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
@@ -120,21 +130,24 @@ class _Block:
 
         Raises RollbackFailed for parameters that were not restored.
         """
-        await run_shielded(self._write_previous(self._take_saved(), cause))
+        self._has_ended = True
+        await run_shielded(self._write_previous(cause))
 
-    async def _write_previous(self, saved: list[Parameter], cause: BaseException | None) -> None:
+    async def _write_previous(self, cause: BaseException | None) -> None:
         answers: Mapping[str, object] = {}
         reason = ""
-        with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
-            try:
-                names = [param.name for param in saved if self._access.written.get(param.name) is not None]
-                present = await self._access.read(names, self._idle_timeout_s)
-                # Keep values that another station has set. Parameters that cannot be read count as not restored.
-                saved = [param for param in saved if not self._was_changed(param.name, present.get(param.name))]
-                to_write = [param for param in saved if isinstance(present.get(param.name, param), Parameter)]
-                answers = await self._access.write(to_write, self._idle_timeout_s)
-            except AerokitError as error:
-                reason = f" ({error})"
+        async with self._registry.lock:
+            saved = self._take_saved()
+            with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
+                try:
+                    names = [param.name for param in saved if self._access.written.get(param.name) is not None]
+                    present = await self._access.read(names, self._idle_timeout_s)
+                    # Keep values that another station has set. Parameters that cannot be read count as not restored.
+                    saved = [param for param in saved if not self._was_changed(param.name, present.get(param.name))]
+                    to_write = [param for param in saved if isinstance(present.get(param.name, param), Parameter)]
+                    answers = await self._access.write(to_write, self._idle_timeout_s)
+                except AerokitError as error:
+                    reason = f" ({error})"
         _raise_not_restored(
             [param for param in saved if not _is_restored(param, answers.get(param.name))], reason, cause
         )
