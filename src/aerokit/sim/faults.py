@@ -132,7 +132,7 @@ class Faults:
     def report_progress(
         self, command: int, percents: tuple[int, ...] = (10, 50, 90), *, interval_s: float = 0.5
     ) -> None:
-        """Answer IN_PROGRESS with these percentages before the result, one every ``interval_s`` seconds."""
+        """Answer this MAV_CMD with IN_PROGRESS, a percentage every ``interval_s`` seconds, and then with the result."""
         self.commands[command] = CommandFault(progress=percents, progress_interval_s=interval_s)
 
     def clear(self, command: int | None = None) -> None:

@@ -56,7 +56,8 @@ class SimParameter:
 class SimParameters:
     """Parameters by name, in the vehicle's order. They survive a reboot.
 
-    A value is stored in the type of the parameter: as a 32-bit float, or truncated to an integer within the range.
+    A value is stored in the type of the parameter: as a 32-bit float, or as an integer, which is truncated and limited
+    to the range of the type.
     """
 
     def __init__(self, rows: Iterable[SimParameter]) -> None:

@@ -33,8 +33,8 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. After the loop was blocked, the server simulates the missed time. With a ``speedup`` other than 1, it
-    simulates at most half a second of it, because missing heartbeats would look like a link loss.
+    second. After the loop was blocked, the server simulates the missed time. With a ``speedup`` other than 1, the
+    server simulates only half a second and skips the rest. Otherwise, missing heartbeats would look like a link loss.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
@@ -260,7 +260,8 @@ class SimulatorServer:
         if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at
-        skipped_s = self._loop.time() - due_at - _MAX_CATCH_UP_S / self._speedup
+        late_s, max_late_s = self._loop.time() - due_at, _MAX_CATCH_UP_S / self._speedup
+        skipped_s = late_s - max_late_s
         if skipped_s > 0:  # `now` counts from `_started_at`, so a later start skips time.
             self._started_at += skipped_s
             self._timer_at += skipped_s

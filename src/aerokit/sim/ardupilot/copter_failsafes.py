@@ -216,7 +216,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
                 self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
             self.has_estimator_failed = self._acted_on_estimator = False
             return
-        if not self._had_position or self.has_estimator_failed:  # Act once, and only on the loss of a position.
+        can_start = self._had_position and not self.has_estimator_failed
+        if not can_start:
             return
         lost_for_s = self._position_lost.seconds(condition=True, now=copter.now)
         if lost_for_s >= _ESTIMATOR_TIMEOUT_S:

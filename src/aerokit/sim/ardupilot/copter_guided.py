@@ -31,8 +31,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    DO_CHANGE_SPEED sets a speed limit. As in ArduCopter, another type of target (position, velocity or acceleration)
-    resets the limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
+    DO_CHANGE_SPEED sets a speed limit. When the type of target changes (position, velocity, acceleration), the limits
+    are WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN again, as in ArduCopter.
     """
 
     number: int = CopterMode.GUIDED

@@ -144,7 +144,7 @@ class Px4Mission:
         self._jumps: dict[int, int] = {}  # Number of jumps that each DO_JUMP has done, by its index.
         self._state = int(MissionState.NO_MISSION)  # a MISSION_STATE
         self._repeats_left = 0  # how often MISSION_ITEM_REACHED is still repeated
-        self._is_report_scheduled = False  # True while a repetition is due
+        self._is_report_scheduled = False  # True while `_send_reached` is scheduled
 
     def start(self) -> None:
         self.is_valid = bool(self.count) and rejection(self._px4, self._px4.missions.commands) is None

@@ -42,7 +42,7 @@ class TransferState(Enum):
 
 @dataclass(eq=False)
 class _Link(ListUpload):
-    """State of the latest mission transfer on a link. PX4 still uses it after the transfer has ended."""
+    """State of the latest mission transfer on a link. PX4 uses this state even after the transfer has ended."""
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0  # checksum of the items received so far

@@ -49,7 +49,8 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 class Px4ParameterMount(ParameterPackMount):
     """``@PARAM`` files of PX4. Opening a file reports its exact size.
 
-    A block of 239 bytes never ends inside a value or a default. Uploaded parameters are applied as they arrive.
+    A download is padded, so that no block of 239 bytes, the payload of one MAVFTP packet, ends inside a value or a
+    default. Uploaded parameters are applied as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
