@@ -13,7 +13,7 @@ from aerokit.mavlink.messages import Heartbeat
 
 @dataclass
 class CommandFault:
-    """Fault of one command, which applies ``times`` times. None means that the fault applies every time."""
+    """Fault of the next ``times`` executions of one command, or of all executions if ``times`` is None."""
 
     times: int | None = None
     refuse_with: int | None = None

@@ -17,13 +17,13 @@ from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-# Minimum delay of a timer in loop time with many vehicles, or if the simulation is faster than real time. One callback
-# then runs several ticks.
+# With a speedup, or with more than `_BATCH_THRESHOLD` vehicles, a timer waits at least this many seconds of loop time.
+# One callback then runs several ticks.
 _MIN_BATCH_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
 # With more than `_BATCH_THRESHOLD` vehicles, the output of `_BATCH_INTERVAL_S` simulated seconds is sent together.
 _BATCH_INTERVAL_S = TICK_S
-# Maximum simulated seconds to make up for after the event loop was blocked. In real time, there is no maximum.
+# With a speedup, at most this many simulated seconds are made up for after the event loop was blocked.
 _MAX_CATCH_UP_S = 0.5
 
 
@@ -216,7 +216,7 @@ class SimulatorServer:
                 is_from_vehicle = False
                 self.on_datagram(now, data, is_from_vehicle)
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # The vehicle's time is later than `now` if a timer fired early or another vehicle advanced it.
+                # `vehicle.now` is later than `now` if a timer fired early or another vehicle has advanced this one.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()  # All vehicles have used the decoded messages.

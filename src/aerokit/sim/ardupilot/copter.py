@@ -221,10 +221,10 @@ class SimulatedCopter(CopterHost):
             return _BASE | _GUIDED
         flags = _BASE
         mode_name = self.mode.name
-        # GUIDED_ENABLED is set in modes that use a position. In RTL, it is set only while armed, not in a motor test.
-        if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
+        is_disarmed_return = mode_name == "RTL" and not self.motors.is_armed
+        if mode_name in _GUIDED_MODES and not is_disarmed_return:
             flags |= _GUIDED
-        if self.is_armed:
+        if self.is_armed:  # also during a motor test
             flags |= _ARMED
         return flags
 

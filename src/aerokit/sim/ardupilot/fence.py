@@ -48,7 +48,7 @@ class FenceZones:
         return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
 
     def breach_m(self, place: Point, *, union: bool = False) -> float:
-        """Return the metres beyond the border. They are negative inside the allowed area.
+        """Return the distance beyond the border in metres, which is negative inside the allowed area.
 
         With ``union``, the allowed area is the union of the inclusion zones. Otherwise it is their intersection.
         """

@@ -17,7 +17,7 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
-    """Return all or about ``count`` parameters of a firmware, including all that the simulation reads."""
+    """Return the parameters of a firmware, or about ``count`` of them. Those that the simulation reads are included."""
     used = [name for (name,) in rows_of(kind, "used_parameters.csv")]
     return SimParameters.from_text(_read(f"{kind}.param.csv"), used=used, count=count)
 

@@ -22,7 +22,7 @@ _HOME_SEQ = 0
 
 
 class ItemList:
-    """Base of the lists of mission, fence and rally items. Integer results are MAV_MISSION_RESULTs."""
+    """Base of the lists of mission, fence and rally items. Results of type int are MAV_MISSION_RESULTs."""
 
     name: ClassVar[str]
     """Name of the list in status texts."""

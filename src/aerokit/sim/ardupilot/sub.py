@@ -259,7 +259,7 @@ class SimulatedSub(SubHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
-        """Create the motion model. A SIM_BUOYANCY of 1 accelerates upwards by 0.1 m/s². Wind has no effect."""
+        """Create the motion model. Each unit of SIM_BUOYANCY accelerates upwards by 0.1 m/s². Wind has no effect."""
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
 
     def listen_for_setpoints(self) -> None:

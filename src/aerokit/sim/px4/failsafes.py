@@ -143,7 +143,7 @@ Action = FailsafeAction
 _LINK_ACTIONS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
 _FENCE_ACTIONS = {1: Action.WARN, 2: Action.HOLD, 3: Action.RETURN, 4: Action.TERMINATE, 5: Action.LAND}
 _MODES: dict[FailsafeAction, Px4Mode] = {Action.HOLD: HOLD, Action.RETURN: RTL, Action.LAND: LAND}
-# After this time without a position, PX4 1.17 (SIH, satellites switched off) ends a mode that needs a position.
+# After this time without a position, PX4 leaves a mode that needs a position (measured with PX4 1.17, SIH).
 _POSITION_TIMEOUT_S = 5.0
 _BATTERY_TEXTS = {
     MavBatteryChargeState.LOW: (MavSeverity.CRITICAL, "Low battery"),
@@ -222,9 +222,9 @@ class Px4Failsafes:
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
-        is_known_at_arming = state <= self._battery_at_arming  # The pilot armed in this state, so only warn.
+        is_unchanged_since_arming = state <= self._battery_at_arming  # PX4 then only warns.
         has_action = action in (_BATTERY_LAND, _BATTERY_RETURN)
-        if state == MavBatteryChargeState.LOW or is_known_at_arming or not has_action:
+        if state == MavBatteryChargeState.LOW or is_unchanged_since_arming or not has_action:
             return Action.WARN
         must_land = action == _BATTERY_LAND or state == MavBatteryChargeState.EMERGENCY
         return Action.LAND if must_land else Action.RETURN

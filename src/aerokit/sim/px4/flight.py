@@ -272,5 +272,9 @@ class Px4Flight:
 
 
 def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
-    """Return the speed along one axis towards a point ``offset`` metres away. It has the sign of ``offset``."""
-    return math.copysign(min(limit, approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)), offset)
+    """Return the velocity in m/s along one axis, at most ``limit``, to stop at a point ``offset`` metres away.
+
+    ``acceleration`` is the limit for braking.
+    """
+    speed = approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)
+    return math.copysign(min(limit, speed), offset)
