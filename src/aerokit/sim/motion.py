@@ -115,8 +115,11 @@ def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the speed at which a vehicle approaches a point ``distance`` metres away, to stop there."""
-    # Near the point, the speed is `gain` times the distance. Farther away, it allows a constant deceleration.
+    """Return the speed in m/s at which a vehicle ``distance`` metres from a point can fly, in order to stop there.
+
+    Near the point, the speed is ``gain`` (per second) times the distance. Farther away, the speed is that of a constant
+    ``deceleration``.
+    """
     linear_distance = deceleration / (gain * gain)
     if distance <= linear_distance:
         return distance * gain

@@ -97,7 +97,7 @@ class ArduPilotMode:
 def variant(
     make_mode: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
 ) -> Callable[[HostT], ArduPilotMode]:
-    """Return a factory for a mode with another number and name. ``traits`` are attributes to set."""
+    """Return a factory that calls ``make_mode`` and sets the number, the name and the attributes in ``traits``."""
 
     def make_variant(host: HostT) -> ArduPilotMode:
         mode = make_mode(host)

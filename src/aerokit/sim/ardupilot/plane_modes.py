@@ -67,7 +67,7 @@ class PlaneHost(ArduPilotVehicle):
         """Fly in the take-off direction at cruise speed, and climb as soon as the airspeed suffices."""
         wing = self.wing
         self.lift_off()
-        if wing.is_on_ground:  # Roll straight ahead. The motion model climbs as soon as the airspeed suffices.
+        if wing.is_on_ground:  # Roll straight ahead.
             wing.bank_and_climb(self.cruise_m_s, 0.0, wing.wing_limits.climb_m_s)
         else:
             yaw = wing.yaw if self.take_off_yaw is None else self.take_off_yaw

@@ -147,7 +147,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
-        # `name` is the link that was just checked, which is not always the lost one (failsafe.cpp, failsafe_trigger).
+        # Like the firmware, name the link that was just checked, even if only the other link is lost (failsafe.cpp,
+        # failsafe_trigger).
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
         rover.rc.release_overrides()

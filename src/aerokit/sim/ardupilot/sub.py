@@ -64,7 +64,7 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 
 
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
-    """ArduSub's failsafes. Most of them act only while armed. Not simulated: terrain, estimator, crash."""
+    """ArduSub's failsafes, except those of terrain, estimator and crash. Most of them act only while armed."""
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 

@@ -182,7 +182,8 @@ class Px4Offboard:
         roll, pitch, yaw = attitude
         # In the simulation, a thrust of 0.5 holds the height.
         climb_share = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0
-        motion.seek_attitude(roll, pitch, -climb_share * _CLIMB_AT_FULL_THRUST_M_S)  # a velocity down
+        velocity_down = -climb_share * _CLIMB_AT_FULL_THRUST_M_S
+        motion.seek_attitude(roll, pitch, velocity_down)
         motion.face(yaw)
 
     def _wanted_velocity(self) -> Ned:
