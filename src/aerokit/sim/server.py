@@ -122,7 +122,7 @@ class SimulatorServer:
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
-        connected: set[int] = set()  # ids of vehicles whose first channel is in use; filled by `_channels`
+        connected: set[int] = set()  # `id` of each vehicle whose first channel is in use; filled by `_channels`
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
             opening.push_async_callback(port.close)
@@ -180,8 +180,9 @@ class SimulatorServer:
         for link in self._links:
             link.close()
         owner = self._owner
-        # asyncio only logs the exception of a callback, so the owner is cancelled. In a fixture, it may be done.
-        if owner is not None and not owner.done() and owner is not asyncio.current_task():
+        if owner is None or owner.done():  # The task of a pytest fixture may end before the block ends.
+            return
+        if owner is not asyncio.current_task():  # In a callback, asyncio would only log the exception.
             self._cancels_owner = owner.cancel()
 
     def _stop(self) -> None:

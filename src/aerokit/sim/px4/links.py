@@ -38,7 +38,7 @@ _RETURN_TEXT = re.compile(r"RTL: start return at (-?\d+) m \((-?\d+) m above des
 
 
 class Px4Events:
-    """Sends events. Their sequence number soon overflows, so that tests of clients cover the overflow."""
+    """Sends events. The sequence number starts just below its limit, so that tests of clients cover the overflow."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
