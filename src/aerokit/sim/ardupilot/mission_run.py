@@ -239,7 +239,10 @@ class MissionRun:
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Let a stopped mission resume at the next navigation command. Return False if there is none."""
+        """Let a stopped mission resume at the first navigation command from ``index`` on.
+
+        Return False if there is no such command.
+        """
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:

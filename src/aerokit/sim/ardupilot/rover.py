@@ -180,7 +180,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
                 self.has_estimator_failed = False
                 self.warn("EKF failsafe cleared", MavSeverity.CRITICAL)
             return
-        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:  # Act once, after the timeout.
+        can_start = lost_for >= _ESTIMATOR_TIMEOUT_S and not self.has_estimator_failed
+        if not can_start:
             return
         self.has_estimator_failed: bool = True
         self.warn("EKF variance", MavSeverity.CRITICAL)
