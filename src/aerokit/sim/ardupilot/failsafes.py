@@ -113,11 +113,11 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def battery_is_low(self) -> bool:
-        return self.battery.level > 0
+        return self.battery.level >= _LOW
 
     @property
     def battery_is_critical(self) -> bool:
-        return self.battery.level > 1
+        return self.battery.level >= _CRITICAL
 
     @property
     def is_any_active(self) -> bool:
@@ -302,11 +302,7 @@ class ArduPilotArming(Generic[HostT]):
     def arm(self, *, force: bool = False) -> bool:
         """Arm and return True, or report the failing checks and return False."""
         vehicle = self.vehicle
-        reasons = self.mandatory_reasons() if force else self.reasons()
-        if not reasons and not force:
-            reasons = self.final_reasons()
-        if not vehicle.is_initialised:  # This text replaces the reasons of the checks.
-            reasons = ["System not initialised"]
+        reasons = self._reasons_not_to_arm(force=force)
         if reasons:
             self._send_reasons("Arm", reasons)
             return False
@@ -325,13 +321,21 @@ class ArduPilotArming(Generic[HostT]):
 
     def on_armed(self) -> None: ...
 
+    def _reasons_not_to_arm(self, *, force: bool) -> list[str]:
+        if not self.vehicle.is_initialised:
+            return ["System not initialised"]
+        if force:
+            return self.mandatory_reasons()
+        return self.reasons() or self.final_reasons()
+
     def disarm(self, *, force: bool = True) -> bool:
         """Stop the motors, even in the air. With ``force=False``, a vehicle in the air stays armed."""
         vehicle = self.vehicle
         if not vehicle.motors.is_armed:
             return True
-        is_in_air = not vehicle.is_landed
-        if not self.needs_arming or (is_in_air and not force):  # ARMING_REQUIRE 0 keeps the vehicle armed for ever.
+        if not self.needs_arming:  # ARMING_REQUIRE 0 keeps the vehicle armed for ever.
+            return False
+        if not vehicle.is_landed and not force:
             return False
         vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)

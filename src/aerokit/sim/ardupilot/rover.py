@@ -210,7 +210,7 @@ _HOLD_BEYOND_M = 100.0
 class RoverFence(ArduPilotFence[RoverHost]):
     """ArduRover's fence, which has no altitude limits and sends no texts.
 
-    FENCE_ACTION has the values of FS_ACTION. If it is not 0, a rover more than 100 m outside the fence changes to HOLD.
+    FENCE_ACTION has the values of FS_ACTION. With any action but 0, a rover more than 100 m outside changes to HOLD.
     """
 
     PERIOD_S: ClassVar[float] = 0.1
