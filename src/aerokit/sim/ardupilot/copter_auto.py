@@ -90,7 +90,7 @@ class _CircleLeg:
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
-        # Follow a point on the circle: command the velocity of the point, plus 1 m/s for each metre of distance.
+        # Follow a point on the circle with the velocity of the point, plus 1 m/s for each metre of distance to it.
         north, east, down = self._point()
         speed = rate * self._radius
         velocity_north = -speed * math.sin(self._angle)

@@ -186,10 +186,9 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         has_no_place = (item.x, item.y) == (0, 0)
         if has_no_place:
             north, east = own_north, own_east
-        # The altitude 0 may mean the plane's present altitude.
-        if manoeuvre == _LOITER:  # It does in relative frames (Location.cpp, sanitize).
+        if manoeuvre == _LOITER:  # An altitude of 0 in a relative frame means the present altitude (Location.cpp).
             keeps_altitude = item.z == 0 and item.frame not in _ABSOLUTE
-        else:  # It does together with the coordinates 0 (commands.cpp, set_next_WP).
+        else:  # With zero coordinates, an altitude of 0 means the present altitude (commands.cpp, set_next_WP).
             keeps_altitude = item.z == 0 and has_no_place
         if keeps_altitude:
             down = own_down
