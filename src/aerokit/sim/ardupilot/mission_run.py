@@ -62,7 +62,7 @@ class MissionMode(ArduPilotMode):
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
     def on_disarmed(self) -> None:
-        # Disarming has reset the progress. `update` selects the first command, which waits until the vehicle is armed.
+        # Disarming has reset the progress. `update` starts the first command, which waits until the vehicle is armed.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 
