@@ -89,8 +89,8 @@ def return_destination(px4: Px4Host) -> Ned:
 def _place(px4: Px4Host, item: MissionItem) -> Ned:
     north, east = px4.frame.to_local(round(item.x), round(item.y))
     _, _, home_down = px4.home
-    reference = home_down if item.frame in _RELATIVE else px4.frame.origin.altitude_m
-    return (north, east, reference - item.z)
+    down_at_zero_altitude = home_down if item.frame in _RELATIVE else px4.frame.origin.altitude_m
+    return (north, east, down_at_zero_altitude - item.z)
 
 
 _SPOOL_UP_S = 1.8

@@ -323,7 +323,8 @@ class Px4Mission:
             return (north, east, motion.down)
         _, _, home_down = px4.home
         is_relative = item.frame == MavFrame.GLOBAL_RELATIVE_ALT
-        return (north, east, (home_down if is_relative else px4.frame.origin.altitude_m) - item.z)
+        down_at_zero_altitude = home_down if is_relative else px4.frame.origin.altitude_m
+        return (north, east, down_at_zero_altitude - item.z)
 
     def update(self) -> None:
         item, flight = self._item, self._px4.flight
