@@ -191,9 +191,14 @@ def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
 
 
 def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    requested = (to_int(command.param1), to_int(command.param2))
-    system, component = map(_id_in_control, requested, gimbal.in_control, gimbal.own_ids, command.sender)
-    gimbal.in_control = (system, component)
+    requested_system, requested_component = to_int(command.param1), to_int(command.param2)
+    system, component = gimbal.in_control
+    own_system, own_component = gimbal.own_ids
+    sender_system, sender_component = command.sender
+    gimbal.in_control = (
+        _id_in_control(requested_system, system, own_system, sender_system),
+        _id_in_control(requested_component, component, own_component, sender_component),
+    )
     return MavResult.ACCEPTED
 
 

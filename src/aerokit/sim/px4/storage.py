@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pkgutil
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.mavlink.enums import MavParamType, MavSeverity
@@ -61,6 +62,13 @@ class Px4ParameterMount(ParameterPackMount):
         return _Writer(self._parameters, self._apply) if writing else reader
 
 
+class _Announced(NamedTuple):
+    """What the header of an uploaded file announces."""
+
+    entry_count: int
+    file_size: int
+
+
 class _Writer(FileHandle):
     """Upload of parameters, which are applied as they arrive.
 
@@ -73,7 +81,7 @@ class _Writer(FileHandle):
         self._apply = apply
         self._pending = b""  # Received bytes that are not yet a complete entry.
         self._written = 0  # number of bytes received so far
-        self._announced: tuple[int, int] | None = None  # Number of entries and file size; None before the header.
+        self._announced: _Announced | None = None  # None before the header
         self._count = 0  # number of entries that were applied
         self._previous_name = b""  # name in the last entry; the next name may begin with the same letters
         self._is_rejected = False  # True once the upload has failed
@@ -89,13 +97,11 @@ class _Writer(FileHandle):
         self._pending += new_bytes
         self._written += len(new_bytes)
         self._parse()
-        if self._announced is not None:
-            _, size = self._announced
-            if self._written > size:
-                raise self._rejection()
+        if self._announced is not None and self._written > self._announced.file_size:
+            raise self._rejection()
 
     def close(self) -> None:
-        is_complete = not self._pending and self._announced == (self._count, self._written)
+        is_complete = not self._pending and self._announced == _Announced(self._count, self._written)
         if self._is_rejected or not is_complete:
             raise FileFault(EINVAL)
 
@@ -112,7 +118,7 @@ class _Writer(FileHandle):
             magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
                 raise self._rejection()
-            self._announced = (count, size)
+            self._announced = _Announced(count, size)
             self._pending = self._pending[HEADER.size :]
         while self._apply_next_entry():
             pass
