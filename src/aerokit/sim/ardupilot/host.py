@@ -57,7 +57,7 @@ class ArduPilotMode:
         self.vehicle = vehicle
 
     def enter(self, *, force: bool) -> bool:
-        """Send the entry texts and start the mode. Return False to refuse it.
+        """Send the entry texts and start the mode. Return False to refuse the mode.
 
         With ``force``, a subclass may accept a mode that cannot run yet. The vehicle forces a mode while it is
         disarmed.

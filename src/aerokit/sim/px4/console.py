@@ -66,7 +66,7 @@ class Px4LogStream:
         # System id and component id of the client; None while no log is streamed.
         self._client: tuple[int, int] | None = None
         self._channel: Channel | None = None
-        self._stream_number = 0  # number of this stream; scheduled calls of `_run` for an earlier number do nothing
+        self._stream_number = 0  # number of this stream; a scheduled `_send_block` of an earlier stream does nothing
         self._sequence = 0  # number of the next block
         self._tries = 0  # how often this block was sent
         self._acknowledged = 0  # number of definition blocks that were acknowledged
@@ -82,7 +82,7 @@ class Px4LogStream:
         self._channel = command.channel
         self._sequence = self._tries = self._acknowledged = 0
         self._stream_number += 1
-        self._run_later(self._stream_number)
+        self._schedule_block(self._stream_number)
         return MavResult.ACCEPTED
 
     def stop(self, _: ReceivedCommand) -> int:
@@ -99,10 +99,10 @@ class Px4LogStream:
     def _sends_definitions(self) -> bool:
         return self._acknowledged < _DEFINITION_BLOCKS
 
-    def _run_later(self, stream: int) -> None:
-        self._px4.call_later(_BLOCK_INTERVAL_S, lambda: self._run(stream))
+    def _schedule_block(self, stream: int) -> None:
+        self._px4.call_later(_BLOCK_INTERVAL_S, lambda: self._send_block(stream))
 
-    def _run(self, stream: int) -> None:
+    def _send_block(self, stream: int) -> None:
         if self._client is None or stream != self._stream_number:
             return
         self._tries += 1
@@ -120,7 +120,7 @@ class Px4LogStream:
         self._px4.send(block, self._channel)
         if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.
             self._sequence += 1
-        self._run_later(stream)
+        self._schedule_block(stream)
 
 
 def _ulog_message(number: int) -> bytes:
