@@ -13,7 +13,7 @@ from aerokit.mavlink.messages import Heartbeat
 
 @dataclass
 class CommandFault:
-    """Fault of the next ``times`` executions of one command, or of all executions if ``times`` is None."""
+    """Fault that applies to the next ``times`` commands with the same MAV_CMD, or to all if ``times`` is None."""
 
     times: int | None = None
     refuse_with: int | None = None

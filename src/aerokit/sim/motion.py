@@ -115,7 +115,7 @@ def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the speed in m/s at which a vehicle ``distance`` metres from a point can fly, in order to stop there.
+    """Return the speed in m/s that lets a vehicle stop at a point ``distance`` metres away.
 
     Near the point, the speed is ``gain`` (per second) times the distance. Farther away, the speed is that of a constant
     ``deceleration``.

@@ -241,7 +241,7 @@ class ParameterPackMount(Mount):
 
 
 class _Reader(FileHandle):
-    """Download of parameters. All reads must have the same size, because padding depends on the size of a block."""
+    """Download of parameters. All reads must have the same size, which is the block size of the padding."""
 
     def __init__(self, parameters: SimParameters, path: str, block: int | None) -> None:
         query = _query(path)

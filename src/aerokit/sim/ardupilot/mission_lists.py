@@ -22,7 +22,7 @@ _HOME_SEQ = 0
 
 
 class ItemList:
-    """Base of the lists of mission, fence and rally items. Results of type int are MAV_MISSION_RESULTs."""
+    """Base of the lists of mission, fence and rally items. `put` and `finish` return a MAV_MISSION_RESULT."""
 
     name: ClassVar[str]
     """Name of the list in status texts."""

@@ -104,13 +104,15 @@ _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """Message signing of ArduPilot. The time stamp is stored every 30 s. A port starts a minute after the stored time.
+    """Message signing of ArduPilot, which sends no status text about a new key.
 
-    The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. If your
-    only link represents a radio, set ``trusts_first_port`` to False and call `load`.
+    The time stamp is stored every 30 s. When a port begins to sign, its time stamp is the stored one plus a minute.
 
-    If bit 0 of MAV1_OPTIONS is set, the first port does not sign, and with MAV2_OPTIONS the second port. A change of
-    the bit takes effect at the next boot or SETUP_SIGNING. ArduPilot sends no status text about a new key.
+    The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. If the
+    only link of the vehicle is a radio, set ``trusts_first_port`` to False and call `load`.
+
+    Bit 0 of MAV1_OPTIONS turns signing off on the first port, and bit 0 of MAV2_OPTIONS on the second. A change of the
+    bit takes effect at the next boot or SETUP_SIGNING.
     """
 
     AHEAD: ClassVar[int] = ONE_MINUTE

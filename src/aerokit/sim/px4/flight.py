@@ -272,9 +272,9 @@ class Px4Flight:
 
 
 def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
-    """Return the velocity in m/s along one axis, at most ``limit``, to stop at a point ``offset`` metres away.
+    """Return the velocity in m/s along one axis that lets a vehicle stop at a point ``offset`` metres away.
 
-    ``acceleration`` is the limit for braking.
+    The velocity is at most ``limit``. ``acceleration`` (m/s²) limits the braking.
     """
     speed = approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)
     return math.copysign(min(limit, speed), offset)
