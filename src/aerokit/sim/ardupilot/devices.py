@@ -86,8 +86,9 @@ class ArduPilotDevices:
         if action == WinchActions.RATE_CONTROL:
             self.line_rate_m_s = constrained(rate_m_s, -_WINCH_RATE_M_S, _WINCH_RATE_M_S)
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
+            direction = (length_m > 0) - (length_m < 0)  # 1, 0 or -1; 0 for NaN
             self._goal_m = self.line_m + length_m
-            self.line_rate_m_s = _WINCH_RATE_M_S * ((length_m > 0) - (length_m < 0))  # 0 for NaN
+            self.line_rate_m_s = _WINCH_RATE_M_S * direction
         self._schedule_step()
         return Result.ACCEPTED
 
