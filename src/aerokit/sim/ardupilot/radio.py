@@ -105,7 +105,7 @@ class ArduPilotRadio:
             value = getattr(override, f"chan{index + 1}_raw")
             is_upper = index >= len(self._sticks)  # one of the channels 9 to 16
             is_unchanged = value == _UNCHANGED or (is_upper and value == 0)
-            is_release = value == (_RELEASE_UPPER if is_upper else 0)
+            is_release = value == _RELEASE_UPPER if is_upper else value == 0
             if not is_unchanged:
                 self._overrides[index] = (0 if is_release else value, vehicle.now)
 
