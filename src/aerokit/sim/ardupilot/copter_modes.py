@@ -72,7 +72,7 @@ class AutoYaw:
         self._control = self._turn
 
     def set_region_of_interest(self, point: Ned | None) -> None:
-        """Face a place. None ends this."""
+        """Face a place. With None, apply the default heading again."""
         gimbal = self._copter.gimbal
         # A fitted gimbal turns instead of the copter.
         gimbal.look_at(point)

@@ -90,7 +90,7 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the downloaded MAV_FRAME of an item that was uploaded with ``frame``, or None if it is refused."""
+    """Return the downloaded MAV_FRAME of an item that was uploaded with ``frame``. None if the frame is refused."""
     return _DOWNLOADED_FRAMES.get(frame)
 
 

@@ -26,7 +26,7 @@ _TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
 _BEFORE_TAKE_OFF = frozenset({Cmd.DO_AUX_FUNCTION, Cmd.NAV_DELAY})
 # Navigation commands with a number above NAV_LAST.
 _NAVIGATION_ABOVE_LAST = frozenset({Cmd.NAV_SET_YAW_SPEED, Cmd.NAV_SCRIPT_TIME, Cmd.NAV_ATTITUDE_TIME})
-# Commands that are complete as soon as they have started, on every vehicle, without a status text.
+# Commands that every vehicle supports, and that are complete as soon as they have started.
 _INSTANT = frozenset(
     {
         Cmd.DO_GRIPPER, Cmd.DO_SET_SERVO, Cmd.DO_SET_RELAY, Cmd.DO_REPEAT_SERVO, Cmd.DO_REPEAT_RELAY,

@@ -105,7 +105,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A low battery is not included, because it does not cause MAV_STATE_CRITICAL on Rover.
+        # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
         return bool(self._triggered) or self.has_estimator_failed
 
     def update(self) -> None:

@@ -79,7 +79,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A lost radio is not included, because on Sub it alone does not cause MAV_STATE_CRITICAL.
+        # On Sub, a lost radio does not cause MAV_STATE_CRITICAL.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
         return self.is_pilot_lost or self.battery_is_low or self.is_ground_station_lost or self.is_leak_detected or hull
 

@@ -76,7 +76,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return the destination of RTL. The heights of RTL are relative to its down coordinate."""
+    """Return the destination of RTL. The heights in parameters of RTL are relative to the destination."""
     rtl_type = round(px4.parameters["RTL_TYPE"])
     rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:

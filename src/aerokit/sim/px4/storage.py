@@ -63,7 +63,7 @@ class Px4ParameterMount(ParameterPackMount):
 
 
 class _Announced(NamedTuple):
-    """What the header of an uploaded file announces."""
+    """Number of entries and file size that the header of an uploaded file announces."""
 
     entry_count: int
     file_size: int
@@ -214,9 +214,10 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 
 
 class Px4Signing(VehicleSigning):
-    """Message signing of PX4. A text reports a new key, and unsigned heartbeats are accepted.
+    """Message signing of PX4. A text reports a new key.
 
-    PX4 stores the time stamp only together with a new key. Version 1.16 does not support signing.
+    Unsigned HEARTBEAT, ADSB_VEHICLE and COLLISION messages are accepted. PX4 stores the time stamp only together with a
+    new key. Version 1.16 does not support signing.
     """
 
     def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:
