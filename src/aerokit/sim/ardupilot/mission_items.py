@@ -38,7 +38,7 @@ class StoredCommand(NamedTuple):
     name: str
     """Name of the command in status texts; empty if a mission cannot contain the command."""
     parameters: str
-    """Storage types (see `_CONVERSIONS`) of params 1 to 4, and of x, y and z if they are no position.
+    """Storage types (see `_CONVERSIONS`) of params 1 to 4, and of x, y and z if they are not a position.
 
     Empty for an unsupported command.
     """

@@ -98,7 +98,7 @@ class Px4Fence:
         while index < len(items):
             item = items[index]
             if item.command in _POLYGONS:
-                count = max(1, int(item.param1))  # The number of corners, which every corner contains.
+                count = max(1, int(item.param1))  # Param 1 of each corner is the number of corners.
                 corners = [self._place(corner) for corner in items[index : index + count]]
                 yield _Area(_POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east))
                 index += count
