@@ -80,7 +80,7 @@ GRAVITY_M_S2 = 9.80665
 # quadrotor of 450 mm does.
 _DRAG_PER_S = 0.33
 _VELOCITY_TIME_CONSTANT_S = 0.3
-# Share of a lean error that remains after a second. The lean has a time constant of 0.15 s, and steps of 0.02 s.
+# Share of a lean error that remains after a second, which has 50 steps of 0.02 s. The time constant is 0.15 s.
 _LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
@@ -115,8 +115,11 @@ def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the speed at which a vehicle approaches a point ``distance`` metres away, to stop there."""
-    # Near the point, the speed is `gain` times the distance. Farther away, it allows a constant deceleration.
+    """Return the speed in m/s that lets a vehicle stop at a point ``distance`` metres away.
+
+    Near the point, the speed is ``gain`` (per second) times the distance. Farther away, the speed is that of a constant
+    ``deceleration``.
+    """
     linear_distance = deceleration / (gain * gain)
     if distance <= linear_distance:
         return distance * gain
@@ -177,7 +180,7 @@ class Motion:
         self.yaw_rate: float = 0.0
         self.impact_speed_m_s: float = 0.0
         """Vertical speed at the last touchdown."""
-        # Present wind in addition to the mean wind, in m/s.
+        # Present gust in m/s, which is added to the mean wind.
         self._gust_north = 0.0
         self._gust_east = 0.0
         self._jerk_m_s3 = math.inf  # present change of the acceleration; infinite before the first step

@@ -151,7 +151,8 @@ class Px4ParameterServer(ParameterServer):
     """Parameter protocol of PX4. With ``sends_errors``, it sends PARAM_ERROR, as PX4 does after version 1.16.
 
     Values are stored without a check. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly
-    after. Setting _HASH_CHECK stops a running list. A second list request restarts the list, without the hash.
+    after. A list begins with _HASH_CHECK. A request during a list restarts the list without _HASH_CHECK. A PARAM_SET
+    of _HASH_CHECK stops the list.
     """
 
     burst = 10

@@ -31,8 +31,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    DO_CHANGE_SPEED sets a speed limit. As in ArduCopter, another type of target (position, velocity or acceleration)
-    resets the limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
+    DO_CHANGE_SPEED sets a speed limit. When the type of target changes (position, velocity, acceleration), the limits
+    are WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN again, as in ArduCopter.
     """
 
     number: int = CopterMode.GUIDED
@@ -301,8 +301,8 @@ class CopterSetpoints:
             copter.motion.face(yaw)
         elif not ignored_rates:
             copter.motion.turn(target.body_yaw_rate)
-        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. Bit 3 of GUID_OPTIONS, which would make it
-        # set the throttle, is not simulated.
+        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. Bit 3 of GUID_OPTIONS, with which `thrust`
+        # sets the throttle, is not simulated.
         climb_share = (constrained(target.thrust, 0.0, 1.0) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0

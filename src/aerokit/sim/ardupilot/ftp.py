@@ -95,9 +95,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Do nothing. The firmware closes an idle session only at a request for another session."""
 
     def _answer(self, client: ServedClient, request: FtpPacket) -> None:
-        # A request for another session closes an idle session. Otherwise, the firmware refuses the request.
+        # A request for another session closes the open session if it is idle, and is refused otherwise.
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
-        if client.sessions and request.session not in client.sessions and not is_close:
+        is_for_other_session = bool(client.sessions) and request.session not in client.sessions
+        if is_for_other_session and not is_close:
             if not self._is_idle():
                 self._reply(client, request.refuse(MavFtpErr.INVALIDSESSION))
                 return

@@ -17,7 +17,7 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
-    """Return all or about ``count`` parameters of a firmware, including all that the simulation reads."""
+    """Return the parameters of a firmware, or about ``count`` of them. Those that the simulation reads are included."""
     used = [name for (name,) in rows_of(kind, "used_parameters.csv")]
     return SimParameters.from_text(_read(f"{kind}.param.csv"), used=used, count=count)
 
@@ -43,7 +43,7 @@ class BootTimeline:
 
     heartbeat: float = 0.92
     ready: float = 2.36
-    """The vehicle is initialised: streams start and missions are accepted. 0.5 s later, MAV_STATE_BOOT ends."""
+    """The vehicle is initialised: streams start and missions are accepted. MAV_STATE_BOOT ends about 0.5 s later."""
     estimator_active: float = 4.36
     tilt_aligned: float = 5.70
     yaw_aligned: float = 5.80

@@ -14,10 +14,10 @@ from aerokit.sim.vehicle import MessageHost
 
 
 class Px4Ftp(SessionFtpServer[FileTree]):
-    """MAVFTP server of PX4. Every session has the number 0, and is closed after 10 s without a request.
+    """MAVFTP server of PX4. Each link has one session (number 0), which ends after 10 s without a request.
 
-    A burst ignores the requested size. A refusal may report the errno of an earlier failure, which only a directory
-    listing clears. `Faults.no_ftp` turns the server off.
+    A burst ignores the requested size. After a failure, the next refusals may report its errno, until the client has
+    listed a directory. `Faults.no_ftp` turns the server off.
     """
 
     max_clients: ClassVar[int] = 1 << 16
