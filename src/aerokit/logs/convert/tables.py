@@ -221,7 +221,8 @@ class MessageTablesWriter:
             name = f"{len(self._tables)}_{name}"
         table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
         self._tables.append(table)
-        # add_numbers() needs Python's numbers. Rows without a message, of a flight controller's log, may have NumPy's.
+        # add_numbers() needs Python's numbers. Rows from a flight controller's log, which have no message, may contain
+        # NumPy's numbers.
         has_only_numbers = record.message is not None and all(column.kind != "str" for column in columns)
         add_row = table.add_numbers if has_only_numbers else table.add
         self._converters[record.table] = add_row, _row_maker(columns, record)

@@ -138,18 +138,17 @@ def _complete_altitudes(flight: FlightLog) -> None:
     home_amsl_m = flight.home.altitude_amsl_m if flight.home is not None else None
     if home_amsl_m is None:
         return
+    is_home_at_sea_level = abs(home_amsl_m) <= _SAME_ALTITUDE_M
     for series in (flight.track, flight.position_target):
         amsl, relative = series["altitude_amsl_m"], series["altitude_relative_m"]
         for row, relative_m in enumerate(relative):
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
-            # While ArduPilot knows only one altitude, it logs this value in both columns. Equal values show this,
-            # unless home is near sea level.
-            elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # If the value is nearer to home's altitude than to 0, it is an altitude above sea level. Otherwise, it
-                # is a height above home.
-                if abs(amsl_m - home_amsl_m) < abs(amsl_m):
+            # While ArduPilot knows only one of the two altitudes, it logs the same value in both columns.
+            elif not is_home_at_sea_level and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
+                is_above_sea_level = abs(amsl_m - home_amsl_m) < abs(amsl_m)  # nearer to home's altitude than to 0
+                if is_above_sea_level:
                     relative[row] = amsl_m - home_amsl_m
                 else:
                     amsl[row] = math.nan

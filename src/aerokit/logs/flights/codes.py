@@ -149,7 +149,7 @@ def clean_text(text: str) -> str:
 
 
 def ardupilot_system_id(parameters: Mapping[str, float]) -> int:
-    """Return the system id that the parameters contain; 1, ArduPilot's default, if none of them is valid."""
+    """Return the system id in the parameters; ArduPilot's default of 1 if it is absent or invalid."""
     system_id = parameters.get("MAV_SYSID", parameters.get("SYSID_THISMAV", 1))  # renamed in 4.7
     return int(system_id) if 1 <= system_id <= 255 else 1
 

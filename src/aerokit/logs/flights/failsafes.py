@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
-# This longer time applies if the autopilot delays its reaction. Without satellites, autopilots continue with dead
-# reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
+# Evidence may be this far apart if the autopilot delays its reaction. Without satellites, autopilots continue with
+# dead reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
 # A reaction is a mode change or disarming within these times after the last evidence.
 _REACTION_TIMEOUT_S, _DISARMING_TIMEOUT_S = 12.0, 3.0
@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe. If ``acted`` is False, it is only a warning: the autopilot did not certainly react."""
+    """A failsafe. If ``acted`` is False, it is only a warning: no reaction is certain to come from the autopilot."""
 
     time_s: float
     kind: str
@@ -271,7 +271,7 @@ def _battery_context(flight: FlightLog, time_s: float) -> list[str]:
         if math.isnan(voltage):
             continue
         text = f"{battery_name(number)}: {voltage:.2f} V"
-        earlier_voltage = battery.at("voltage_v", time_s - 60, not_older_s=30)
+        earlier_voltage = battery.at("voltage_v", time_s - 60, max_age_s=30)
         if not math.isnan(earlier_voltage):
             text += f", {earlier_voltage:.2f} V one minute before"
         for name, template in (
@@ -354,7 +354,7 @@ def _attitude_context(flight: FlightLog, time_s: float) -> list[str]:
         angles = flight.attitude.between(name, time_s - 3, time_s)
         if len(angles):
             maximum = max(angles, key=abs)
-            setpoint = flight.attitude_target.at(name, time_s, not_older_s=2)
+            setpoint = flight.attitude_target.at(name, time_s, max_age_s=2)
             text = f"{name.removesuffix('_deg')} up to {maximum:.0f}° in the 3 s before"
             if not math.isnan(setpoint):
                 text += f", set-point {setpoint:.0f}°"

@@ -331,9 +331,7 @@ class _Reader:
             east.add(*row)
         for time, north_m, north_m_s in self._tables.rows("PSCN", "TPN", "TVN"):
             # The rows of one set-point are logged together. One of them may be lost.
-            east_m, east_m_s = (
-                east.at(name, time + _SAME_SETPOINT_S, not_older_s=2 * _SAME_SETPOINT_S) for name in east
-            )
+            east_m, east_m_s = (east.at(name, time + _SAME_SETPOINT_S, max_age_s=2 * _SAME_SETPOINT_S) for name in east)
             if plane is not None and not math.isnan(east_m):
                 latitude, longitude = plane.degrees(north_m, east_m)
                 self._flight.position_target.add(time, latitude, longitude, NAN, NAN)  # _add_heights() adds altitudes

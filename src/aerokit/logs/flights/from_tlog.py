@@ -41,7 +41,7 @@ _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 # If a record is earlier than the previous one by more than this, the recording's clock was set back.
 _MAX_DISORDER_S = 1.0
 # A record is skipped as damaged if its time differs from the previous record's by more than this. If the next record
-# has a similar time, the time is right.
+# has about the same time as the skipped one, the clock has jumped, and reading continues with the new time.
 _DOUBTFUL_JUMP_S = 3600.0
 # If no HEARTBEAT arrives for longer than this, the arming state is unknown.
 _MAX_HEARTBEAT_INTERVAL_S = 5.0
@@ -156,7 +156,7 @@ class _Reader:
                             doubtful_unix_s = unix_s
                             damaged += 1
                             continue
-                        damaged -= 1  # the skipped record was right
+                        damaged -= 1  # the skipped record was not damaged
                     if step_s > 0:
                         paused_s += step_s
                     else:
@@ -396,7 +396,7 @@ class _Reader:
 
     def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
-            # The yaw is NaN, because `nav_bearing` is no yaw of the vehicle, but the course of a fixed wing.
+            # The yaw is NaN, because a fixed wing reports its course in `nav_bearing`, not a yaw.
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
             if -180 <= message.nav_bearing <= 360 and not math.isnan(self._relative_m):
                 self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)

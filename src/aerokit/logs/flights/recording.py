@@ -97,8 +97,8 @@ class LinkCounter:
         if time_s >= self._second + 1:  # this frame is the first one of a new second
             self._received += received - 1
             received = 1
-            if int(time_s) - self._second > 1:  # _add_row() records the seconds without frames as 100 % loss
-                missing = 0
+            if int(time_s) - self._second > 1:
+                missing = 0  # _add_row() already shows the seconds between as 100 % loss
             self._add_row(int(time_s))
         self._received += received
         self._lost += missing
@@ -124,7 +124,7 @@ class LinkCounter:
         """Add a row for the counted second, and start to count ``second``."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        # No frames arrived in the seconds between. Rows for the first and the last of them show a loss of 100 %.
+        # No frames arrived in the seconds between these two. The first and the last of them get a row.
         if second - self._second > 1:
             self._series.add(self._second + 1, *_ALL_LOST)
             self._series.add(second - 1, *_ALL_LOST)

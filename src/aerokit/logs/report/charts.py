@@ -88,7 +88,7 @@ def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float]
 
 
 def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[int]:
-    """Select about ``max_rows`` rows, so that a chart of them shows all peaks and the longer gaps."""
+    """Select about ``max_rows`` rows with which a chart still shows all peaks and the longer gaps."""
     count = len(values)
     if count <= max_rows:
         return list(range(count))

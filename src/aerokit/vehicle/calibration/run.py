@@ -64,7 +64,7 @@ class CalibrationRun:
         self._cannot_cancel_reason = ""  # why the calibration cannot be cancelled, for the user; empty if it can be
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
-        # Holds the order that cancels the calibration. The arbiter keeps this order until the stack is closed.
+        # Closed when the calibration ends: removes callbacks, and ends the order that cancels the calibration.
         self._cleanup = ExitStack()
         self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False

@@ -71,7 +71,7 @@ class External:
         return self._stream("motion_capture", PoseMeasurement, self._encode.motion_capture, rate_hz, valid_for_s)
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
-        """Supply a satellite position (GPS_INPUT). Set GPS1_TYPE to 14 on ArduPilot; PX4 does not read GPS_INPUT."""
+        """Supply positions from a satellite receiver (GPS_INPUT). Only ArduPilot reads them: set GPS1_TYPE to 14."""
         return self._stream("gps", GpsMeasurement, self._encode.gps, rate_hz, valid_for_s)
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:

@@ -56,9 +56,10 @@ class TargetLoss(Snapshot):
 class LandingReport(Snapshot):
     """Report of a precision landing, made when the vehicle is on the ground and disarmed.
 
-    ``last_target`` is the last measurement, and ``unseen_s`` its age at the end: a camera rarely sees the target from
-    close by. ``losses`` are the earlier periods of more than a second in which the target was not visible.
-    ``climbed_m`` is how far the vehicle climbed during the landing, in a retry of ArduPilot or a search of PX4.
+    ``last_target`` is the last measurement. ``unseen_s`` is its age at the end, usually above 0, because a camera
+    rarely sees the target from close by. ``losses`` are the periods of more than a second after which the target was
+    visible again. ``climbed_m`` is how far the vehicle climbed during the landing, in a retry of ArduPilot or a search
+    of PX4.
     ``used_target`` is False if no measurement was sent during the descent; the vehicle then landed where its firmware
     chose. ``texts`` are the vehicle's status texts since the order.
     """

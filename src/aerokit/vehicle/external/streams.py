@@ -245,7 +245,7 @@ class MeasurementStream(Generic[MeasurementT]):
                 continue
             if present_name is None:
                 raise OperationRejected(
-                    f"{measurement}: this build of {firmware} ignores the measurements, because it has no"
+                    f"{measurement}: this build of {firmware} ignores the measurements, because it has no parameter"
                     f" {' or '.join(names)}"
                 )
             choices = " or ".join(f"{value:g}" for value in allowed[:4])

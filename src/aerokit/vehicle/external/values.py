@@ -167,7 +167,10 @@ class TargetMeasurement(Snapshot):
     def from_angles(
         cls, forward_deg: float, right_deg: float, height_m: float, *, is_level: bool = False
     ) -> TargetMeasurement:
-        """Return a target ``height_m`` below a camera that sees it at these angles from straight down."""
+        """Return a target that a camera sees at these angles from straight down.
+
+        ``height_m`` is the height of the camera above the target.
+        """
         forward, right = (math.tan(math.radians(angle)) * height_m for angle in (forward_deg, right_deg))
         return cls(forward, right, height_m, is_level)
 

@@ -294,8 +294,8 @@ class NtripClient:
         finally:
             if position_task is not None:
                 position_task.cancel()
-                # Ignore the task's exception. If sending the position has failed, reading has failed too, which gives
-                # the reason.
+                # Ignore the task's exception. If the task cannot send the position, reading fails too, and `reason` is
+                # set from that failure.
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {message_count} messages")

@@ -82,8 +82,8 @@ class SensorHealth(Snapshot):
 class EstimatorHealth(Snapshot):
     """State estimator health from EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
 
-    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that are needed for
-    flight by position but are not good yet. Ratios are innovations divided by their limits: below 1 is good.
+    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that flight by
+    position needs but that are not good yet. Ratios are innovations divided by their limits: below 1 is good.
     Accuracies are one standard deviation, in metres.
     """
 

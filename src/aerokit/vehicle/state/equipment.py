@@ -219,14 +219,15 @@ def cell_voltages_mv(message: messages.BatteryStatus) -> list[int]:
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
     # Cells 11 to 14 are an extension of the message, in which an absent cell may be 0 instead of U16.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
-    # PX4 reports a battery on CAN that does not measure its voltage as 0 mV.
+    # If a battery on CAN does not measure its voltage, PX4 reports 0 mV.
     return cells_mv if any(cells_mv) else []
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
     """Return all batteries reported so far, with the new values of this message's battery."""
     cells_mv = cell_voltages_mv(message)
-    # If the cells are not measured one by one, the message reports the total as one "cell" or several (see FULL_CELL).
+    # If the cells are not measured one by one, the message has the total voltage, in one or several "cells" (see
+    # FULL_CELL).
     is_only_total = len(cells_mv) == 1 or FULL_CELL in cells_mv
     battery = Battery(
         id=message.id,

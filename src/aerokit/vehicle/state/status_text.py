@@ -70,7 +70,7 @@ class StatusTextAssembler:
         return tuple(text for text in self._recent if text.at >= since)
 
     def about_failsafes(self) -> tuple[StatusText, ...]:
-        """Return up to 64 texts about failsafes and problems in flight, received since the last failsafe ended."""
+        """Return the last texts (64 at most) about failsafes and problems, received since the last failsafe ended."""
         return tuple(self._failsafes)
 
     def clear_failsafes(self) -> None:

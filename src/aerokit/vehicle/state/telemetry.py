@@ -65,7 +65,6 @@ class Telemetry(States):
         """True once AVAILABLE_MODES was received."""
         # Maps custom_mode to the name in AVAILABLE_MODES.
         self._mode_names: dict[int, str] = {}
-        # Additional input of the decoders, the same object for all of them.
         self._context = Context(self.autopilot, self._mode_names, lambda: self.home.is_known)
         self._cells: dict[str, StateCell[Any]] = {
             name: StateCell(name, clock, field.waits_for(self.autopilot), stamp=self._time_of_arrival)
@@ -232,7 +231,7 @@ class Telemetry(States):
         """Return the function that updates the cell of a state from one type of message."""
         cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
-        # A frame that was kept undecoded must not replace a newer value from a message of another type.
+        # A lazy message is decoded late. It must not replace a newer value from a message of another type.
         may_be_older = message_source.message in LAZY and len(field.sources) > 1
 
         def update(message: Any, source: Source) -> None:
