@@ -192,7 +192,7 @@ class FailsafeEvidence(Snapshot):
 class FlightLog:
     """One flight: time series and lists. Times are seconds since ``begins_at``.
 
-    What the log does not contain is an empty series, list or string.
+    An empty series, list or string means that the log does not contain the data.
     """
 
     path: Path

@@ -140,19 +140,21 @@ class _Tables:
             chunk = [_scaled(unpacked[position], scale) for position, scale in zip(positions, scales, strict=True)]
             times_us, *values = chunk
             times = [(time_us - self.began_us) / 1e6 for time_us in times_us]
-            if times[-1] > self._max_s or not all(map(operator.le, times, times[1:])):
+            increases = all(map(operator.le, times, times[1:]))
+            if not increases or times[-1] > self._max_s:
                 kept = [self._is_plausible(times, row) for row in range(len(times))]
                 self.damaged.update(offsets[begin + row] for row, is_kept in enumerate(kept) if not is_kept)
                 times, *values = (list(compress(column, kept)) for column in (times, *values))
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        # Rows have no checksum. After a time that is too late, `TimeSeries` would use this time for all later rows.
+        # Rows have no checksum. `TimeSeries` would use a time that is too late for all later rows, too.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time
         is_outlier = time > after + _MAX_DISORDER_S or time < before - _MAX_DISORDER_S
-        return time <= self._max_s and not (is_outlier and 0.0 <= before <= after + _MAX_DISORDER_S)
+        neighbours_agree = 0.0 <= before <= after + _MAX_DISORDER_S  # otherwise one of them may be the outlier
+        return time <= self._max_s and not (is_outlier and neighbours_agree)
 
     def _first_time(self) -> int:
         # Use the row that is first in the file. The row with the lowest time could be a damaged one.

@@ -324,11 +324,13 @@ class _Reader:
 
     def _note_missing_heartbeats(self) -> None:
         self._end_heartbeat_gap(self._flight.duration_s)
-        # Do not count silences, in which no message arrived: the report describes them separately.
-        missing_s = sum(
-            end - begin - sum(max(min(end, s.ends_s) - max(begin, s.begins_s), 0.0) for s in self._flight.silences)
-            for begin, end in self._armed_gaps
-        )
+
+        def silent_s(begin_s: float, end_s: float) -> float:
+            overlaps = (min(end_s, s.ends_s) - max(begin_s, s.begins_s) for s in self._flight.silences)
+            return sum(max(overlap_s, 0.0) for overlap_s in overlaps)
+
+        # The report describes silences, in which no message at all arrived, separately.
+        missing_s = sum(end - begin - silent_s(begin, end) for begin, end in self._armed_gaps)
         if missing_s > _MAX_HEARTBEAT_INTERVAL_S:
             self._flight.notes.append(
                 f"for {missing_s:.0f} s, other messages arrived, but no HEARTBEAT: this time counts as armed, although"

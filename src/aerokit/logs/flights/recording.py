@@ -19,7 +19,8 @@ MIN_SILENCE_S = 3.0
 """Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 
 # If the clocks drift apart by more than _MAX_CLOCK_DRIFT (0.2 is 20 %), the vehicle is a simulation that did not run in
-# real time. In less than _MIN_CLOCK_COMPARISON_S, the delays of the link would distort the comparison.
+# real time. In less than _MIN_CLOCK_COMPARISON_S, the delays of the link would distort the comparison. The comparison
+# treats an interval between two messages as long from _MAX_CLOCK_GAP_S on.
 _MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
 
 
@@ -137,7 +138,7 @@ def is_real_time(speed: float) -> bool:
 
 
 def use_simulated_time(flight: FlightLog, speed: float) -> None:
-    """Convert all times to the vehicle's seconds, if the vehicle is a simulation at another speed."""
+    """Convert all times to the vehicle's seconds, if the vehicle is a simulation that did not run in real time."""
     if is_real_time(speed):
         return
     recorded_s = flight.duration_s

@@ -191,8 +191,8 @@ class CalibrationControl:
     ) -> Calibration:
         """Return a calibration that has not started yet.
 
-        ``command_param`` is the number, from 1, of the MAV_CMD_PREFLIGHT_CALIBRATION parameter that becomes
-        ``param_value``. 0: the procedure needs no parameters.
+        ``command_param`` is the number (from 1) of the MAV_CMD_PREFLIGHT_CALIBRATION parameter that is set to
+        ``param_value``; 0 if the procedure needs no parameters.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"

@@ -69,7 +69,7 @@ class CalibrationRun:
         self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
         self._is_abandoned = False
-        # True from the first cancel command on, until the vehicle has confirmed the cancellation.
+        # True from `abandon` on, until the vehicle has confirmed the cancellation.
         self._is_unconfirmed = False
         self._ended = asyncio.Event()  # set once the calibration has ended on the vehicle
 
@@ -197,7 +197,6 @@ class CalibrationRun:
                         self._is_unconfirmed = False
                         return
                     if is_taken_over:  # The command might disturb the other party.
-                        self._is_unconfirmed = True
                         return
                     if not self.context.arbiter.is_state_recent:
                         continue
@@ -218,9 +217,9 @@ class CalibrationRun:
         if self._has_rebooted:
             return True
         assert self._cancel_sent_at is not None
-        # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
             return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
+        # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if self.session.autopilot.calibration_protocol != "texts":
             # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp), so any answer confirms it.
             return self.session.commands.last_result(int(cancel_command)) is not None

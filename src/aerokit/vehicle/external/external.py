@@ -86,7 +86,10 @@ class External:
         return self._stream("obstacle_points", ObstaclePoints, self._encode.obstacle_points, rate_hz, valid_for_s)
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10 and RNGFND1_ORIENT to match."""
+        """Supply a distance (DISTANCE_SENSOR).
+
+        On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT to the direction of the sensor.
+        """
         return self._stream("range_finder", RangeMeasurement, self._encode.range_finder, rate_hz, valid_for_s)
 
     def landing_target(

@@ -78,7 +78,7 @@ class Caster:
         is_scheme_valid = parts.scheme in ("ntrip", "ntrips")
         if not host or not mount or not is_mount_valid or not is_scheme_valid or port == 0:
             raise InvalidArgument(
-                "url is not allowed (it is not shown, because it may contain a password): write"
+                "url is invalid (it is not shown, because it may contain a password): write"
                 " ntrip://user:password@host:2101/MOUNT, with %40 for an @ in the password"
             )
         user, password = unquote(parts.username or ""), unquote(parts.password or "")

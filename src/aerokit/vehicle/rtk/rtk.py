@@ -94,7 +94,8 @@ class Rtk:
         # Numbers of messages and bytes that were sent.
         self._messages = 0
         self._bytes = 0
-        self._recent: deque[tuple[float, int]] = deque()  # time and size of each message in the window
+        # Time and size of each message in the last BANDWIDTH_WINDOW_S.
+        self._recent: deque[tuple[float, int]] = deque()
 
     @property
     def corrections(self) -> StateCell[Corrections]:

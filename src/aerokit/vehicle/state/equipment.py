@@ -350,8 +350,8 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    Yaw from the nose and yaw from north are converted to each other by ``delta_yaw`` in the message, or by the
-    vehicle's ``heading`` in degrees. If both are unknown, the result has only the yaw in the message.
+    The message has the yaw from the nose or the yaw from north. The other one is computed with the message's
+    ``delta_yaw`` or, if that is unknown, with the vehicle's ``heading`` in degrees. It is None if both are unknown.
     """
     pitch, roll, yaw = _euler(message.q)
     # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.

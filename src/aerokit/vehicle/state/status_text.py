@@ -47,7 +47,8 @@ class StatusTextAssembler:
     def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
         """Add one message. Return the texts that are complete or truncated now.
 
-        By the standard, a text with the id 0 has a single chunk. Pass ``joins_id_0`` if it may have several.
+        By the standard, a text with the id 0 has a single chunk. ``joins_id_0`` is True if the autopilot also splits
+        texts with this id.
         """
         truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
