@@ -211,6 +211,14 @@ def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
+def _px4_battery(row: Mapping[str, Any]) -> Battery:
+    remaining = row["remaining"]
+    percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
+    current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1 means unknown
+    voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0 means unknown
+    return Battery(id=0, voltage_v=voltage_v, current_a=current_a, remaining_percent=percent)
+
+
 def _ardupilot_battery(fields: Mapping[str, Any]) -> States:
     number = fields.get("Instance", fields.get("Inst", 0))
     if number != 0:  # the state lists all batteries, but a row has only one, so only the first is used
@@ -330,12 +338,7 @@ class _Px4States:
         elif table == "vehicle_status":
             return (("armed", row["arming_state"] == 2),)  # ARMING_STATE_ARMED
         elif table == "battery_status":
-            remaining = row["remaining"]
-            percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
-            current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1 means unknown
-            voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0 means unknown
-            battery = Battery(id=0, voltage_v=voltage_v, current_a=current_a, remaining_percent=percent)
-            return (("batteries", (battery,)),)
+            return (("batteries", (_px4_battery(row),)),)
         elif table == "logged_messages":
             return (("status_text", StatusText(row["severity"], clean_text(row["message"]))),)
         return ()

@@ -303,10 +303,11 @@ class _Reader:
             return
         # If the estimator has no positions, use those of the first GPS receiver that has a 3D fix.
         number_column = ("I",) if self._tables.has("GPS", "I") else ()
-        used_receiver = None
-        for time, status, latitude, longitude, amsl, *receiver in self._tables.rows(
+        used_receiver: int | None = None
+        for time, status, latitude, longitude, amsl, *number in self._tables.rows(
             "GPS", "Status", "Lat", "Lng", "Alt", *number_column
         ):
+            receiver = number[0] if number_column else 0
             if status >= GpsFixType.TYPE_3D_FIX and used_receiver in (None, receiver):
                 used_receiver = receiver
                 track.add(time, latitude, longitude, amsl, NAN)
@@ -325,7 +326,7 @@ class _Reader:
         self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
 
     def _read_targets(self) -> None:
-        # The log has positions relative to the estimator's origin.
+        # The set-points (PSCN, PSCE) are relative to the estimator's origin.
         origin = self._origin()
         plane = None if origin is None else TangentPlane(*origin)
         east = TimeSeries("m", "m_s")

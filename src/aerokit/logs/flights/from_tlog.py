@@ -152,7 +152,8 @@ class _Reader:
                 elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
                     step_s = unix_s - previous_unix_s
                     if abs(step_s) > _DOUBTFUL_JUMP_S:
-                        if abs(unix_s - doubtful_unix_s) > _DOUBTFUL_JUMP_S:
+                        is_like_skipped = abs(unix_s - doubtful_unix_s) <= _DOUBTFUL_JUMP_S
+                        if not is_like_skipped:
                             doubtful_unix_s = unix_s
                             damaged += 1
                             continue

@@ -238,11 +238,8 @@ class Telemetry(States):
             value = decode(message)
             if value is None:  # The message does not have the value, so the cell keeps its previous value.
                 return
-            if may_be_older:
-                latest = cell.source
-                is_other_type = latest is not None and latest.message != source.message
-                if is_other_type and self._time_of_arrival() < cell._updated_at:
-                    return
+            if may_be_older and _is_from_other_message(cell, source) and self._time_of_arrival() < cell._updated_at:
+                return
             cell.set(value, source)
 
         def update_with_context(message: Any, source: Source) -> None:
@@ -277,9 +274,7 @@ class Telemetry(States):
 
     def _has_recent_better_value(self, cell: StateCell[Any], source: Source) -> bool:
         """Return True if another message than the fallback ``source`` recently reported the value."""
-        latest = cell.source
-        is_other_message = latest is not None and latest.message != source.message
-        return is_other_message and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
+        return _is_from_other_message(cell, source) and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
 
     # --------------------------------------------------------- messages with special handling
 
@@ -316,6 +311,11 @@ class Telemetry(States):
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:
             self.status_text.set(text, source)
+
+
+def _is_from_other_message(cell: StateCell[Any], source: Source) -> bool:
+    """Return True if the value of the cell is from another message type than ``source``."""
+    return cell.source is not None and cell.source.message != source.message
 
 
 def is_reported_on_ground(vehicle: States, *, max_age_s: float = LANDED_STATE_MAX_AGE_S) -> bool:
