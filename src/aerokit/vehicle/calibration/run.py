@@ -192,10 +192,10 @@ class CalibrationRun:
                 if must_send:
                     # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                     await self.session.wait_for_heartbeat(self._cancel_sent_at)
-                    is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
                     if self._has_rebooted:  # The reboot has ended the calibration.
                         self._is_unconfirmed = False
                         return
+                    is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
                     if is_taken_over:  # The command might disturb the other party.
                         return
                     if not self.context.arbiter.is_state_recent:

@@ -201,9 +201,9 @@ class Settings:
                     listed = await transfers.run(exchange)
                     if self._reboots != reboots_before:
                         continue  # A part of the list is from before the reboot.
-                    unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
-                    # Prefer the values in `_known`: `_store` has also recorded the messages during the download.
-                    self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
+                    # The order is the component's. The values in `_known` take precedence, because `_store` has also
+                    # recorded the messages during the download.
+                    self._known = {**listed, **self._known}
                     self._is_complete = True
                     break
                 return self.table

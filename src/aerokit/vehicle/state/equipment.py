@@ -355,11 +355,10 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> G
     """
     pitch, roll, yaw = _euler(message.q)
     # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.
-    has_delta_yaw = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
-    if has_delta_yaw and message.delta_yaw:  # PX4 also sends a ``delta_yaw`` of 0 while the heading is unknown.
-        nose_heading: float | None = math.degrees(message.delta_yaw)
-    else:
-        nose_heading = heading
+    sends_delta_yaw = bool(message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME))
+    # PX4 also sends a ``delta_yaw`` of 0 while the heading is unknown.
+    knows_delta_yaw = sends_delta_yaw and math.isfinite(message.delta_yaw) and message.delta_yaw != 0
+    nose_heading = math.degrees(message.delta_yaw) if knows_delta_yaw else heading
     pitch_and_roll = (_rounded(pitch), _rounded(roll))
     if _is_from_nose(message.flags):
         yaw_from_north = None if nose_heading is None else _rounded_to_360(yaw + nose_heading)

@@ -177,7 +177,7 @@ class StreamedMessage:
         "_apply",
         "_cells",
         "_component_id",
-        "_decode_from",
+        "_decode_due_at",
         "_instance_at",
         "_is_watched",
         "_lock",
@@ -198,8 +198,8 @@ class StreamedMessage:
         self._lock = lock
         # Offset of the instance number in `Frame.body`, None if the message has none.
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
-        # The first frame that arrives at or after this time is decoded at once.
-        self._decode_from = -math.inf
+        # From this time on, a frame is decoded when it arrives, even if no cell is read.
+        self._decode_due_at = -math.inf
         # True while one of the cells has observers.
         self._is_watched = False
         self.pending: dict[int, Frame | Message] = {}
@@ -212,8 +212,8 @@ class StreamedMessage:
         """
         if frame.component_id != self._component_id:
             return
-        if self._is_watched or frame.received_at >= self._decode_from:
-            self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
+        if self._is_watched or frame.received_at >= self._decode_due_at:
+            self._decode_due_at = frame.received_at + MAX_DECODE_DELAY_S
             # Without the lock, a thread that reads a cell could apply older frames between `catch_up` and `_apply`.
             with self._lock:
                 if self.pending:
@@ -249,4 +249,4 @@ class StreamedMessage:
     def forget(self) -> None:
         with self._lock:
             self.pending.clear()
-            self._decode_from = -math.inf
+            self._decode_due_at = -math.inf
