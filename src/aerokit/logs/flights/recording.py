@@ -54,7 +54,7 @@ class ClockComparison:
     def speed(self) -> float:
         """Seconds by which the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
         recorded_s, vehicle_s = self._recorded_s, self._vehicle_s
-        if not self._is_comparable:
+        if not self._is_comparable:  # A fast simulation may have only long intervals.
             recorded_s, vehicle_s = recorded_s + self._long_recorded_s, vehicle_s + self._long_vehicle_s
             if min(recorded_s, vehicle_s) < _MIN_CLOCK_COMPARISON_S:
                 return 1.0
