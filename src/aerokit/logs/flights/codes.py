@@ -112,10 +112,10 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# For these subsystems, the error code has another meaning, which is in the comment.
-_MODE_CHANGE = 10  # number of the refused mode
-_ESTIMATOR_SWITCH = 24  # number of the new estimator
-_FENCE = 9  # bits of AC_FENCE_TYPE
+# Subsystems whose error code has a meaning of its own.
+_MODE_CHANGE = 10  # the code is the number of the refused mode
+_ESTIMATOR_SWITCH = 24  # the code is the number of the new estimator
+_FENCE = 9  # the code has the bits of AC_FENCE_TYPE
 _FENCE_TYPES = {
     1: "above the maximum altitude",
     2: "outside the circle",

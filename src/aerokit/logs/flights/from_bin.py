@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 import struct
 from collections import defaultdict
 from itertools import compress
@@ -82,9 +83,8 @@ class _Tables:
     def __init__(self, reader: Any) -> None:
         self._reader = reader
         self.began_us = self._first_time()
-        self._max_s = (
-            max((time_us for _, time_us in self._rows_at(-2)), default=math.inf) - self.began_us
-        ) / 1e6 + _MAX_LATE_S
+        second_to_last_us = max((time_us for _, time_us in self._rows_at(-2)), default=math.inf)
+        self._max_s = (second_to_last_us - self.began_us) / 1e6 + _MAX_LATE_S
         self.damaged: set[int] = set()
         """Offsets of the rows that were skipped because their time is impossible."""
 
@@ -183,14 +183,7 @@ class _Tables:
 
 def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
     """Return the struct layout of rows in which all columns except ``indices`` are padding."""
-    codes, begin = [], 1  # the layout begins with "<"
-    layout = row_format.msg_struct
-    while begin < len(layout):
-        end = begin
-        while layout[end].isdigit():
-            end += 1
-        codes.append(layout[begin : end + 1])
-        begin = end + 1
+    _, *codes = re.findall(r"\d*\D", row_format.msg_struct)  # "<Qf64s" has the codes "Q", "f" and "64s"
     padded = [code if index in indices else f"{struct.calcsize('<' + code)}x" for index, code in enumerate(codes)]
     return "<" + "".join(padded)
 

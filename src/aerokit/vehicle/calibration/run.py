@@ -64,7 +64,7 @@ class CalibrationRun:
         self._cannot_cancel_reason = ""  # why the calibration cannot be cancelled, for the user; empty if it can be
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
-        # Closed when the calibration ends: removes callbacks, and ends the order that cancels the calibration.
+        # Closed when the calibration ends: removes the callbacks, and the order that cancels the calibration.
         self._cleanup = ExitStack()
         self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
@@ -128,7 +128,7 @@ class CalibrationRun:
         """Record that the vehicle has ended the calibration."""
         if not self._ended.is_set():
             self._ended.set()
-            self._cleanup.close()  # If a cancel command was sent, it is not sent again after this.
+            self._cleanup.close()
             if self in self._runs:
                 self._runs.remove(self)
 

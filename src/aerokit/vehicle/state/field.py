@@ -206,7 +206,7 @@ class StreamedMessage:
         """The latest frame or decoded message of each instance number, until it is applied to the cells."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
-        """Keep a frame until a cell is read. Apply it now if a cell has observers, or after MAX_DECODE_DELAY_S.
+        """Keep a frame until a cell is read. Apply it now if a cell has observers, and once per MAX_DECODE_DELAY_S.
 
         ``message`` is the decoded frame, if it was decoded already.
         """
