@@ -280,11 +280,11 @@ def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOu
     frame = message.received_frame
     # MAVLink 1 has no extension fields, so the message has only the first eight outputs of the port.
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT
-    outputs: tuple[int, ...] = _SERVOS(message)[:count]
-    known_outputs: tuple[int, ...] = () if context.before is None else context.before.outputs_us
     first_index = message.port * OUTPUTS_PER_PORT
-    missing = (0,) * (first_index - len(known_outputs))  # the outputs of earlier ports that were not reported yet
-    return ServoOutputs((*known_outputs[:first_index], *missing, *outputs, *known_outputs[first_index + count :]))
+    outputs: list[int] = [] if context.before is None else list(context.before.outputs_us)
+    outputs += [0] * (first_index - len(outputs))  # the outputs of earlier ports that were not reported yet
+    outputs[first_index : first_index + count] = _SERVOS(message)[:count]
+    return ServoOutputs(tuple(outputs))
 
 
 def vibration(message: messages.Vibration) -> Vibration:
