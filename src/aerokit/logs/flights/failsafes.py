@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe. If ``acted`` is False, it is only a warning: no reaction is certain to come from the autopilot."""
+    """A failsafe or, if ``acted`` is False, a warning to which the autopilot did not certainly react."""
 
     time_s: float
     kind: str

@@ -221,7 +221,7 @@ class CalibrationRun:
             return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
         # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if self.session.autopilot.calibration_protocol != "texts":
-            # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp), so any answer confirms it.
+            # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp). So any answer is a confirmation.
             return self.session.commands.last_result(int(cancel_command)) is not None
         # PX4 acknowledges PREFLIGHT_CALIBRATION twice, with different results, so its HEARTBEAT is the confirmation.
         status = self.session.telemetry.system_status

@@ -307,7 +307,7 @@ class Component(ReadOnly):
         return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz)
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return the state value of the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
         return self._session.subscriber.cell(message_type, rate_hz)
 
     @contextmanager

@@ -116,10 +116,10 @@ class External:
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Returns when the vehicle acknowledges it.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Wait until the vehicle acknowledges it.
 
-        No message reports whether the vehicle uses it. ArduPilot uses the wind in its simpler estimator (DCM), PX4 in
-        EKF2.
+        No message reports whether the vehicle uses the estimate. ArduPilot uses it in its simpler estimator (DCM), PX4
+        in EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.

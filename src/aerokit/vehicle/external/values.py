@@ -128,7 +128,8 @@ class ObstacleSectors(Snapshot):
 class ObstaclePoints(Snapshot):
     """Positions of obstacles in metres forward, right and down of the vehicle (OBSTACLE_DISTANCE_3D).
 
-    Each point is sent as one message. If there are no points, nothing is sent, and the vehicle keeps its obstacles.
+    Each point is sent as one message. If there are no points, nothing is sent, and the vehicle keeps the earlier
+    obstacles.
     """
 
     points_m: tuple[Vector, ...]

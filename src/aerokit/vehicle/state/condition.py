@@ -263,7 +263,7 @@ def estimator_health(message: messages.EstimatorStatus, context: Context) -> Est
 def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
     """Return the mission progress in MISSION_CURRENT."""
     state = enum_member(MissionState, message.mission_state)
-    if message.total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the number.
+    if message.total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the total.
         return MissionProgress(current=None, total=None, state=state)
     return MissionProgress(known(message.seq, unknown=U16), known(message.total, unknown=0), state)
 

@@ -20,7 +20,7 @@ CHUNK_LENGTH = 50
 CHUNK_TIMEOUT_S = 2.0
 """Seconds to wait for the next chunk of a text."""
 MAX_RECENT_TEXTS = 64
-# Maximum number of chunks of one text. A text with more chunks is invalid, and is passed on as several texts.
+# Maximum number of chunks of one text. A text with more chunks is invalid, and becomes several texts.
 MAX_CHUNKS = 20
 # Maximum number of incomplete texts of all components together. Beyond it, the oldest text is discarded.
 MAX_OPEN = 16
@@ -34,7 +34,7 @@ class StatusTextAssembler:
     """Joins the chunks of long texts (https://mavlink.io/en/messages/common.html#STATUSTEXT).
 
     A text ends with the first chunk that is not full. If a chunk is missing, or the next chunk does not arrive within
-    two seconds, the text is passed on with "…" in place of the missing part. Trailing whitespace is removed.
+    two seconds, the text has "…" in place of the missing part. Trailing whitespace is removed.
     """
 
     def __init__(self) -> None:
