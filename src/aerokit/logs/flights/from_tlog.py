@@ -26,7 +26,7 @@ from aerokit.vehicle.state.movement import Attitude
 from aerokit.vehicle.state.status_text import StatusTextAssembler
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.logs.flights.flight import FlightLog
     from aerokit.mavlink.message import Message
@@ -240,9 +240,8 @@ class _Reader:
         if setpoints.has("latitude_deg"):
             return
         has_heights = setpoints.has()  # NAV_CONTROLLER_OUTPUT has heights without positions
-        rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints.names), strict=True))
-        columns = (destinations[name] for name in destinations.names)
-        for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
+        rows = list(_rows_of(setpoints))
+        for time, latitude, longitude, amsl, relative in _rows_of(destinations):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
         merged = TimeSeries(*setpoints.names)
@@ -495,6 +494,11 @@ class _Reader:
 
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
+
+
+def _rows_of(series: TimeSeries) -> Iterator[tuple[float, ...]]:
+    """Yield the time and the values of each row."""
+    return zip(series.times, *(series[name] for name in series.names), strict=True)
 
 
 def _message_id_bytes(kind: type[Message]) -> bytes:

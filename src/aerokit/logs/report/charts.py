@@ -156,6 +156,7 @@ def time_range(begin_s: float, end_s: float) -> list[float]:
 
 
 def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
+    # The shapes are SVG paths over the whole height, 0 to 1: rectangles for modes, vertical lines for events.
     spans: dict[str, list[str]] = {}
     for change, end in flight.mode_spans():
         band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
@@ -247,7 +248,8 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     rows_by_mode: dict[str, list[int | None]] = {}  # None interrupts the line
     for (start, end), change in zip(pairwise(boundaries), changes, strict=True):
         # The line of a mode ends at the first position of the next mode, so that the track has no gaps.
-        part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
+        first, last = bisect_left(rows, start), bisect_left(rows, end)
+        part = rows[first : last + 1] if start < end else []
         if part:
             mode_rows = rows_by_mode.setdefault(change.name, [])
             if mode_rows:  # the mode was used before

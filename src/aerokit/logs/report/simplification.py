@@ -43,8 +43,8 @@ def simplify(
         keep: indices that are selected if their coordinates are known.
 
     Returns:
-        The selected indices, with one index for each gap, and the largest distance of an omitted point from the line
-        through the selected points.
+        The indices of the selected points and of one NaN for each gap, and the largest distance of an omitted point
+        from the line through the selected points.
     """
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):

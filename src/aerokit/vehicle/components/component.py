@@ -262,7 +262,7 @@ class Component(ReadOnly):
             with anyio.move_on_after(timeout):
                 commands = self._session.commands
                 for attempts_left in reversed(range(REQUEST_ATTEMPTS)):
-                    is_doubtful = commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, self.component_id)
+                    may_get_late_ack = commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, self.component_id)
                     try:
                         await commands.send_long(
                             MavCmd.REQUEST_MESSAGE,
@@ -275,7 +275,7 @@ class Component(ReadOnly):
                         pass
                     except CommandRejected as error:
                         # If the refusal may belong to an earlier request, it counts only after the last attempt.
-                        refusal = None if is_doubtful and attempts_left else error
+                        refusal = None if may_get_late_ack and attempts_left else error
                     if refusal is not None:
                         wait_s = 0.0  # Return the message only if it has arrived already.
                     elif attempts_left:
