@@ -232,7 +232,7 @@ def _mode_change_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> 
 def _disarming_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> _Reaction | None:
     time_s, until_s = group[0].time_s, group[-1].time_s + _DISARMING_TIMEOUT_S
     disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
-    # If the vehicle was still armed at the end of the log, `flight.armed` ends with the log instead of a disarming.
+    # A span of `flight.armed` may also end with the log, without a disarming.
     if disarmed_s is None or disarmed_s >= flight.duration_s:
         return None
     # Disarming counts as the autopilot's reaction only after evidence of a crash.

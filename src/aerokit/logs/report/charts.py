@@ -92,6 +92,7 @@ def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[in
     count = len(values)
     if count <= max_rows:
         return list(range(count))
+    # From each of `pieces` parts of equal length, draw the lowest and the highest value.
     pieces = max(max_rows // 2, 1)
     selected = {0, count - 1}
     for piece in range(pieces):

@@ -239,7 +239,7 @@ class CalibrationRun:
         timeout: float = REPORT_TIMEOUT_S,
         timeout_text: str = "the vehicle reported nothing about the calibration",
     ) -> None:
-        """Wait until ``is_ready`` returns a true value. Raises as `await_progress`."""
+        """Wait until ``is_ready`` returns a true value. Raises the errors of `await_progress`."""
         await await_progress(
             self.session,
             self.call_name,
