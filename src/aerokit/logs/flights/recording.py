@@ -110,13 +110,13 @@ class LinkCounter:
         is_recorded = ends_s - begins_s - paused_s >= MIN_SILENCE_S
         self._silences.append(Silence(begins_s, ends_s, is_recorded))
 
-    def end(self, received: int, received_s: float, ends_s: float, paused_s: float) -> None:
-        """Count the last frames, and record a silence from ``received_s`` to the end of the log."""
+    def end(self, received: int, last_frame_s: float, ends_s: float, paused_s: float) -> None:
+        """Count the last frames, and record a silence from the last frame to the end of the log."""
         self._received += received
-        if ends_s - received_s < MIN_SILENCE_S:
+        if ends_s - last_frame_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
             return
-        self.add_silence(received_s, ends_s, paused_s)
+        self.add_silence(last_frame_s, ends_s, paused_s)
         self._add_row(int(ends_s))
         if ends_s > self._second:
             self._series.add(ends_s, *_ALL_LOST)
