@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
-# Evidence may be this far apart if the autopilot delays its reaction. Without satellites, autopilots continue with
-# dead reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
+# This is the maximum time if the autopilot delays its reaction. Without satellites, autopilots continue with dead
+# reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
 # A reaction is a mode change or disarming within these times after the last evidence.
 _REACTION_TIMEOUT_S, _DISARMING_TIMEOUT_S = 12.0, 3.0

@@ -30,8 +30,8 @@ CALIBRATE_AT_BOOT = 3
 END_GRACE_S = 3.0
 # Maximum seconds for restoring a parameter, because a cancelled call must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request for a pose every second until it receives our confirmation. The same request is ignored
-# for this many seconds after the confirmation, because it may have been sent before.
+# ArduPilot repeats its request for a pose every second until it receives our confirmation. After the confirmation, the
+# same request is ignored for this many seconds, because ArduPilot may have sent it before the confirmation arrived.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,

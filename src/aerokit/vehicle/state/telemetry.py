@@ -74,12 +74,12 @@ class Telemetry(States):
         handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
         self._handlers = {MESSAGE_IDS[name]: self._receiver(name, handler) for name, handler in handlers.items()}
         self._streams = {MESSAGE_IDS[name]: self._streamed_message(name, handlers[name]) for name in LAZY}
-        # When a cell is read, it lets these streams decode the frames that they have kept.
+        # When a program reads a cell, the streams of the cell first decode the frames that they have kept.
         for cell_name, cell in self._cells.items():
             lazy_messages = (source.message for source in STATES[cell_name].sources if source.message in LAZY)
             cell._feed_from(*(self._streams[MESSAGE_IDS[name]] for name in lazy_messages))
 
-    # ------------------------------------------------------------------------------- feeding
+    # ----------------------------------------------------------------------------- receiving
 
     @property
     def handles(self) -> Mapping[int, Callable[[Any], None]]:
