@@ -864,7 +864,7 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
-        """Supply a satellite position (GPS_INPUT). Set GPS1_TYPE to 14 on ArduPilot; PX4 does not read GPS_INPUT."""
+        """Supply positions from a satellite receiver (GPS_INPUT). Only ArduPilot reads them: set GPS1_TYPE to 14."""
         return MeasurementStream(self._loop, self._loop.call(self.aio.gps, rate_hz=rate_hz, valid_for_s=valid_for_s))
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
@@ -885,7 +885,10 @@ class External(TwinOf["AsyncExternal"]):
         )
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10 and RNGFND1_ORIENT to match."""
+        """Supply a distance (DISTANCE_SENSOR).
+
+        On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT to the direction of the sensor.
+        """
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -924,10 +927,10 @@ class External(TwinOf["AsyncExternal"]):
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Returns when the vehicle acknowledges it.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Wait until the vehicle acknowledges it.
 
-        No message reports whether the vehicle uses it. ArduPilot uses the wind in its simpler estimator (DCM), PX4 in
-        EKF2.
+        No message reports whether the vehicle uses the estimate. ArduPilot uses it in its simpler estimator (DCM), PX4
+        in EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.
@@ -2453,8 +2456,8 @@ class Calibration(CalibrationTwin):
     def cancel(self) -> None:
         """Cancel the calibration, and return when the vehicle has confirmed the end.
 
-        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps: a
-        loop that waits for the next step in another task ends.
+        Sends nothing if the calibration has not started or has ended. The iterator ends in any case, also for a task
+        that is waiting for the next step.
 
         Raises:
             NotSupported: the vehicle cannot cancel this calibration.
@@ -2474,16 +2477,16 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
     def compass(self) -> Calibration:
         """Calibrate all compasses, while a person turns the vehicle about all its axes.
 
-        ArduPilot reports progress and fitness of each compass; reboot it afterwards. PX4 asks for up to six poses,
-        and for a turn about the vertical axis in each.
+        ArduPilot reports progress and fitness of each compass, and must be rebooted afterwards. PX4 asks for up to six
+        poses, and for a turn about the vertical axis in each.
         """
         return Calibration(self._loop, self._loop.call(self.aio.compass))
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
 
-        ArduPilot waits for a confirmation in each pose; reboot it afterwards. PX4 detects the poses itself, in any
-        order.
+        ArduPilot waits for a confirmation in each pose, and must be rebooted afterwards. PX4 detects the poses itself,
+        in any order.
         """
         return Calibration(self._loop, self._loop.call(self.aio.accelerometer))
 
@@ -3572,7 +3575,7 @@ class Settings(TwinOf["AsyncSettings"]):
         return self._loop.call(self.aio.options, name)
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """Return the selected options that exclude a setting, for example ``("CAM_EXPMODE = Auto",)``."""
+        """Return the options of other settings that exclude a setting now, for example ``("CAM_EXPMODE = Auto",)``."""
         return self._loop.call(self.aio.excluded_by, name)
 
     def download(
@@ -3583,11 +3586,13 @@ class Settings(TwinOf["AsyncSettings"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Mapping[str, Setting]:
-        """Return all settings by name, in the component's order; immediately if they were downloaded before.
+        """Return all settings by name, in the component's order. Download them if they are not complete yet.
+
+        ``refresh`` downloads them in any case.
 
         Raises:
-            ParameterTimeout: the list is incomplete, or the component has no settings; ``table`` has those that
-                arrived.
+            ParameterTimeout: the list is incomplete, or the component has no settings. The error's ``table`` has the
+                settings that arrived.
         """
         return self._loop.run(
             self.aio.download,
@@ -3621,8 +3626,9 @@ class Settings(TwinOf["AsyncSettings"]):
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        If the camera definition is loaded, ``value`` may be the name of an option. Unknown settings that restrict this
-        setting are then read first. Settings that the camera may have changed are read again afterwards.
+        If the camera definition is loaded, ``value`` may be the name of an option. aerokit then first reads the
+        settings that restrict this one, if their values are unknown. Afterwards, it reads the settings that the camera
+        may have changed.
 
         Raises:
             InvalidArgument: the name or value is invalid, or the definition does not allow this value now. Nothing was
@@ -3635,7 +3641,7 @@ class Settings(TwinOf["AsyncSettings"]):
 
 
 class Component(TwinOf["AsyncComponent"]):
-    """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
+    """One component of a vehicle, for example a camera, a gimbal or a companion computer.
 
     Returned by :meth:`aerokit.Vehicle.component`. Commands, messages, rates, parameters and files of the component work
     like those of the autopilot. https://mavlink.io/en/services/component_information.html
@@ -3764,7 +3770,7 @@ class Component(TwinOf["AsyncComponent"]):
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return the state value of the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:

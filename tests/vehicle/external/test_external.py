@@ -344,7 +344,7 @@ async def test_missing_parameters_of_measurements_are_named() -> None:
     simulated.parameters._rows.pop("PRX1_TYPE")
     simulated.parameters._names = None
     async with open_flight(simulated) as flight:
-        error = "this build of ArduCopter ignores the measurements, because it has no PRX1_TYPE or PRX_TYPE$"
+        error = "this build of ArduCopter ignores the measurements, because it has no parameter PRX1_TYPE or PRX_TYPE$"
         with pytest.raises(OperationRejected, match=error):
             async with flight.vehicle.external.obstacles():
                 raise AssertionError("entered")

@@ -221,7 +221,8 @@ class MessageTablesWriter:
             name = f"{len(self._tables)}_{name}"
         table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
         self._tables.append(table)
-        # add_numbers() needs Python's numbers. Rows without a message, of a flight controller's log, may have NumPy's.
+        # add_numbers() needs Python's numbers. Rows from a flight controller's log, which have no message, may contain
+        # NumPy's numbers.
         has_only_numbers = record.message is not None and all(column.kind != "str" for column in columns)
         add_row = table.add_numbers if has_only_numbers else table.add
         self._converters[record.table] = add_row, _row_maker(columns, record)
@@ -258,7 +259,8 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
             *[_cell(record.fields.get(name)) for name in names],
         ]
     parts = [column.field.partition(".") for column in columns]
-    # NAME is added because attrgetter returns a tuple only for two or more names.
+    # The rows begin with record[1:3], the system id and the component id. NAME is added, and then removed again,
+    # because attrgetter returns a tuple only for two or more names.
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
     text_positions = [position for position, column in enumerate(columns) if column.kind == "str"]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.movement import Attitude, Velocity
 
 MAP_FRAME = "map"
-"""Common frame of all vehicles: x is east, y north, z up, in metres. The origin is the first known position."""
+"""Common frame of all vehicles: x is east, y north, z up, in metres. The origin is as for `MapFrame`."""
 _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 _NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
 _JSON_TYPES = {"float": "number", "int": "number", "str": "string", "bool": "boolean"}
@@ -289,7 +289,8 @@ def _schema_of(value: object) -> dict[str, Any]:
     if isinstance(converted, dict):
         return {"type": "object", "properties": {name: _schema_of(item) for name, item in converted.items()}}
     if isinstance(converted, list):
-        items = value if isinstance(value, (list, tuple)) else converted  # `converted` has no annotations
+        # Prefer the items of `value`: their classes have annotations, which tell more than the converted items.
+        items = value if isinstance(value, (list, tuple)) else converted
         return {"type": "array", "items": _schema_of(items[0]) if items else {}}
     return {} if converted is None else {"type": _JSON_TYPES[type(converted).__name__]}
 

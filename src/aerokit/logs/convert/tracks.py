@@ -137,7 +137,8 @@ class KmlWriter(_TrackWriter):
         file = kml.Kml(name=printable(self._log.path.name))
         for system_id, track in self._tracks.items():
             folder = file.newfolder(name=f"vehicle {system_id}")
-            # The fallback is the altitude above home. KML has no mode for it, so it is written as above ground.
+            # Without altitudes above sea level, write the altitudes above home. KML has no mode for them, so they
+            # count as above ground.
             is_absolute = all(position.altitude_amsl_m is not None for _, position in track.points)
             mode = kml.AltitudeMode.absolute if is_absolute else kml.AltitudeMode.relativetoground
             line = folder.newgxtrack(name="track", altitudemode=mode)

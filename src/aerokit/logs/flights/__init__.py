@@ -120,16 +120,16 @@ def _complete(flight: FlightLog) -> None:
 def _armed_at_end_note(flight: FlightLog) -> str:
     note = "the log ends while the vehicle is armed"
     is_silent = bool(flight.silences) and flight.silences[-1].ends_s >= flight.duration_s
-    heard_s = flight.silences[-1].begins_s if is_silent else flight.duration_s
-    height_m = flight.track.at("altitude_relative_m", heard_s)
+    last_heard_s = flight.silences[-1].begins_s if is_silent else flight.duration_s
+    height_m = flight.track.at("altitude_relative_m", last_heard_s)
     if height_m < _FLYING_HEIGHT_M:  # False if the height is unknown (NaN)
         return note
     where = "" if math.isnan(height_m) else f", {height_m:.1f} m above home"
-    sink_m_s = flight.velocity.at("down_m_s", heard_s)
+    sink_m_s = flight.velocity.at("down_m_s", last_heard_s)
     motion = f", sinking at {sink_m_s:.1f} m/s" if sink_m_s >= _SINKING_M_S else ""
     mode = flight.mode_at(flight.duration_s)
     in_mode = f" in {mode}" if mode else ""
-    when = f", last heard {flight.duration_s - heard_s:.0f} s before the end" if is_silent else ""
+    when = f", last heard {flight.duration_s - last_heard_s:.0f} s before the end" if is_silent else ""
     state = f"{where}{in_mode}{motion}{when}"
     return f"{note}{state}: the rest of the flight, and with it a landing or a crash, was not recorded"
 
@@ -138,18 +138,17 @@ def _complete_altitudes(flight: FlightLog) -> None:
     home_amsl_m = flight.home.altitude_amsl_m if flight.home is not None else None
     if home_amsl_m is None:
         return
+    is_home_at_sea_level = abs(home_amsl_m) <= _SAME_ALTITUDE_M
     for series in (flight.track, flight.position_target):
         amsl, relative = series["altitude_amsl_m"], series["altitude_relative_m"]
         for row, relative_m in enumerate(relative):
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
-            # While ArduPilot knows only one altitude, it logs this value in both columns. Equal values show this,
-            # unless home is near sea level.
-            elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # If the value is nearer to home's altitude than to 0, it is an altitude above sea level. Otherwise, it
-                # is a height above home.
-                if abs(amsl_m - home_amsl_m) < abs(amsl_m):
+            # While ArduPilot knows only one of the two altitudes, it logs the same value in both columns.
+            elif not is_home_at_sea_level and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
+                is_above_sea_level = abs(amsl_m - home_amsl_m) < abs(amsl_m)  # nearer to home's altitude than to 0
+                if is_above_sea_level:
                     relative[row] = amsl_m - home_amsl_m
                 else:
                     amsl[row] = math.nan

@@ -112,10 +112,10 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# For these subsystems, the error code has another meaning, which is in the comment.
-_MODE_CHANGE = 10  # number of the refused mode
-_ESTIMATOR_SWITCH = 24  # number of the new estimator
-_FENCE = 9  # bits of AC_FENCE_TYPE
+# Subsystems whose error code has a meaning of its own.
+_MODE_CHANGE = 10  # the code is the number of the refused mode
+_ESTIMATOR_SWITCH = 24  # the code is the number of the new estimator
+_FENCE = 9  # the code has the bits of AC_FENCE_TYPE
 _FENCE_TYPES = {
     1: "above the maximum altitude",
     2: "outside the circle",
@@ -149,7 +149,7 @@ def clean_text(text: str) -> str:
 
 
 def ardupilot_system_id(parameters: Mapping[str, float]) -> int:
-    """Return the system id that the parameters contain; 1, ArduPilot's default, if none of them is valid."""
+    """Return the system id in the parameters; ArduPilot's default of 1 if it is absent or invalid."""
     system_id = parameters.get("MAV_SYSID", parameters.get("SYSID_THISMAV", 1))  # renamed in 4.7
     return int(system_id) if 1 <= system_id <= 255 else 1
 

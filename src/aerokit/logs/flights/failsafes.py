@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.values import Snapshot
 from aerokit.autopilots.failsafe_texts import failsafe_kind
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
-# This longer time applies if the autopilot delays its reaction. Without satellites, autopilots continue with dead
+# This is the maximum time if the autopilot delays its reaction. Without satellites, autopilots continue with dead
 # reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
 # A reaction is a mode change or disarming within these times after the last evidence.
@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe. If ``acted`` is False, it is only a warning: the autopilot did not certainly react."""
+    """A failsafe or, if ``acted`` is False, a warning to which the autopilot did not certainly react."""
 
     time_s: float
     kind: str
@@ -149,7 +149,7 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
     Those from shortly before arming or shortly after disarming are included.
     """
     groups: list[list[FailsafeEvidence]] = []
-    recent_groups: list[list[FailsafeEvidence]] = []
+    recent_groups: list[list[FailsafeEvidence]] = []  # those to which the next evidence may belong
     for evidence in flight.failsafe_evidence:
         is_near_armed = any(
             begin - _BEFORE_ARMING_S <= evidence.time_s <= end + _AFTER_DISARMING_S for begin, end in flight.armed
@@ -190,7 +190,8 @@ def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
 
 def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_of_kind: bool) -> Failsafe:
     kind, time_s = _kind_of(group), group[0].time_s
-    reaction, is_sure = _reaction(flight, time_s, group)
+    reaction = _mode_change_after(flight, group) or _disarming_after(flight, group)
+    is_sure = reaction is not None and reaction.is_sure
     acted = is_sure or any(evidence.is_action for evidence in group)
     context_of_kind = _CONTEXTS.get(kind, _general_context)
     facts = [*_location(flight, time_s), *context_of_kind(flight, time_s)]
@@ -199,16 +200,20 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
         parameters = _missing_parameters(flight, kind)
     facts += parameters
     facts += _texts_before(flight, time_s)
-    reaction = reaction or ("the autopilot reported an action" if acted else "no reaction was logged")
-    return Failsafe(time_s, kind, acted, evidence=tuple(group), reaction=reaction, context=tuple(facts))
+    if reaction is not None:
+        reaction_text = reaction.text
+    else:
+        reaction_text = "the autopilot reported an action" if acted else "no reaction was logged"
+    return Failsafe(time_s, kind, acted, evidence=tuple(group), reaction=reaction_text, context=tuple(facts))
 
 
-def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
-    """Return a description of the reaction, and True if it certainly came from the autopilot.
+class _Reaction(NamedTuple):
+    text: str
+    is_sure: bool  # True if the reaction certainly came from the autopilot
 
-    The description is empty if there was no reaction. ``time_s`` is the time of the first evidence in ``group``.
-    """
-    last_s = group[-1].time_s
+
+def _mode_change_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> _Reaction | None:
+    time_s, last_s = group[0].time_s, group[-1].time_s
     for change in flight.modes:
         is_near = time_s - _EARLY_MODE_CHANGE_S <= change.time_s <= last_s + _REACTION_TIMEOUT_S
         # A mode change after disarming is no reaction to a failsafe: some autopilots then always change the mode.
@@ -220,16 +225,20 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
             # pilot may have made a later one.
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
             cause = "" if is_sure else "; cause not logged"
-            return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
-    until_s = last_s + _DISARMING_TIMEOUT_S
+            return _Reaction(_mode_change_text(change, previous_mode, time_s) + cause, is_sure)
+    return None
+
+
+def _disarming_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> _Reaction | None:
+    time_s, until_s = group[0].time_s, group[-1].time_s + _DISARMING_TIMEOUT_S
     disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
-    # If the vehicle was still armed at the end of the log, `flight.armed` ends with the log instead of a disarming.
-    if disarmed_s is not None and disarmed_s < flight.duration_s:
-        # Disarming counts as the autopilot's reaction only after evidence of a crash.
-        is_sure = _kind_of(group) in CRASH_KINDS
-        cause = "" if is_sure else "; cause not logged"
-        return f"disarmed {max(disarmed_s - time_s, 0):.1f} s later{cause}", is_sure
-    return "", False
+    # A span of `flight.armed` may also end with the log, without a disarming.
+    if disarmed_s is None or disarmed_s >= flight.duration_s:
+        return None
+    # Disarming counts as the autopilot's reaction only after evidence of a crash.
+    is_sure = _kind_of(group) in CRASH_KINDS
+    cause = "" if is_sure else "; cause not logged"
+    return _Reaction(f"disarmed {max(disarmed_s - time_s, 0):.1f} s later{cause}", is_sure)
 
 
 def _mode_change_text(change: ModeChange, previous_mode: str, time_s: float) -> str:
@@ -271,7 +280,7 @@ def _battery_context(flight: FlightLog, time_s: float) -> list[str]:
         if math.isnan(voltage):
             continue
         text = f"{battery_name(number)}: {voltage:.2f} V"
-        earlier_voltage = battery.at("voltage_v", time_s - 60, not_older_s=30)
+        earlier_voltage = battery.at("voltage_v", time_s - 60, max_age_s=30)
         if not math.isnan(earlier_voltage):
             text += f", {earlier_voltage:.2f} V one minute before"
         for name, template in (
@@ -354,7 +363,7 @@ def _attitude_context(flight: FlightLog, time_s: float) -> list[str]:
         angles = flight.attitude.between(name, time_s - 3, time_s)
         if len(angles):
             maximum = max(angles, key=abs)
-            setpoint = flight.attitude_target.at(name, time_s, not_older_s=2)
+            setpoint = flight.attitude_target.at(name, time_s, max_age_s=2)
             text = f"{name.removesuffix('_deg')} up to {maximum:.0f}° in the 3 s before"
             if not math.isnan(setpoint):
                 text += f", set-point {setpoint:.0f}°"

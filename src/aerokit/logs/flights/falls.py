@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.values import Snapshot
 from aerokit.logs.flights.failsafes import CRASH_KINDS, evidence_in_texts
@@ -19,8 +19,8 @@ _MIN_SINK_M_S, _STOPPED_M_S = 3.0, 1.0
 _MIN_HEIGHT_M = 2.0
 # With a higher sink rate, an impact is a fall, not a hard landing. Free fall reaches this speed after two metres.
 _FALL_SINK_M_S = 6.0
-# An impact on the ground stops a vehicle within this time. Motors need longer to stop a fast descent.
-# After a longer interval than _MAX_INTERVAL_S between two velocities, nothing is known about the end of the descent.
+# An impact on the ground stops a vehicle within _IMPACT_S. Motors need longer to stop a fast descent. If the interval
+# between two velocities is longer than _MAX_INTERVAL_S, nothing is known about the end of the descent.
 _IMPACT_S, _MAX_INTERVAL_S = 0.6, 3.5
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
@@ -58,8 +58,8 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    In each of them, the vehicle sank 2 m or more, at 3 m/s or more. It stopped within 0.6 s (or 1.5 intervals of the
-    logged velocities), and one of these is true:
+    In each of them, the vehicle sank 2 m or more, at 3 m/s or more. The descent ended within 0.6 s (or 1.5 intervals of
+    the logged velocities), and one of these is true:
 
     - It was disarmed within 30 s. Until then, its logged height changed by at most 1.5 m.
     - It was at most 3 m above home. In the next 30 s, its logged height changed by at most 1.5 m.
@@ -70,18 +70,19 @@ def falls(flight: FlightLog) -> list[Fall]:
     """
     if not flight.armed:
         return []
-    candidates = [
-        _fall(flight, begin_s, end_s, sink_m_s, was_stopped)
-        for begin_s, end_s, sink_m_s, was_stopped in _descents(flight)
-    ]
+    candidates = [_fall(flight, descent) for descent in _descents(flight)]
     return [fall for fall in candidates if fall is not None]
 
 
-def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
-    """Yield (start, end, highest sink rate near the end, was it stopped) for each fast descent.
+class _Descent(NamedTuple):
+    begin_s: float
+    end_s: float
+    sink_m_s: float  # the highest sink rate near the end
+    has_impact: bool  # False if the log ends during the descent
 
-    A descent is included if it is stopped abruptly, or if the log ends during it.
-    """
+
+def _descents(flight: FlightLog) -> Iterator[_Descent]:
+    """Yield the fast descents that end abruptly, and the one during which the log ends."""
     begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
     last_fast_s = -math.inf  # the last time at which it sank fast
     previous_s = -math.inf
@@ -98,25 +99,26 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
             max_stop_s = max(_IMPACT_S, 1.5 * min(time_s - previous_s, _MAX_INTERVAL_S))
             was_fast = last_fast_s > begin_s
             if was_fast and time_s - last_fast_s <= max_stop_s:
-                yield begin_s, time_s, sink_m_s, True
+                yield _Descent(begin_s, time_s, sink_m_s, has_impact=True)
             begin_s, sink_m_s = time_s, 0.0
         previous_s = time_s
     is_fast_at_end = last_fast_s == previous_s and last_fast_s > begin_s
     if is_fast_at_end:
-        yield begin_s, last_fast_s, sink_m_s, False
+        yield _Descent(begin_s, last_fast_s, sink_m_s, has_impact=False)
 
 
-def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_impact: bool) -> Fall | None:
+def _fall(flight: FlightLog, descent: _Descent) -> Fall | None:
     """Return the fall or hard landing in which a descent ends; None if the vehicle may have continued to fly."""
+    begin_s, end_s, sink_m_s, has_impact = descent
     begin_height_m = flight.track.at("altitude_relative_m", begin_s)
     end_height_m = flight.track.at("altitude_relative_m", end_s)
     lost_height_m = begin_height_m - end_height_m
     if not lost_height_m >= _MIN_HEIGHT_M:  # `not >=` is also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    # If the log ends during the descent, the vehicle must be at most two seconds above the ground.
-    near_ground_m = 2 * sink_m_s
-    is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < near_ground_m
+    # If the log ends during the descent, the vehicle must reach the ground within two more seconds at this rate.
+    hits_ground_soon = end_height_m < 2 * sink_m_s
+    is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else hits_ground_soon
     if not (is_on_ground or reasons):  # Logged reasons suffice at any height.
         return None
     return Fall(
@@ -131,7 +133,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle stays at about ``height_m`` until it is disarmed. Only 30 s are examined."""
+    """Return True if the vehicle stays at about ``height_m`` until it is disarmed, or near home for 30 s."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log

@@ -71,10 +71,10 @@ class TimeSeries:
         """Return the index of the last row at or before this time; -1 if there is none."""
         return bisect_right(self.times, time_s) - 1
 
-    def at(self, name: str, time_s: float, *, not_older_s: float = 10.0) -> float:
-        """Return the last known value at or before a time; NaN if it is more than ``not_older_s`` older."""
+    def at(self, name: str, time_s: float, *, max_age_s: float = 10.0) -> float:
+        """Return the last known value at or before a time; NaN if there is none in the ``max_age_s`` before it."""
         column, index = self._values[name], self.index_at(time_s)
-        while index >= 0 and self.times[index] >= time_s - not_older_s:
+        while index >= 0 and self.times[index] >= time_s - max_age_s:
             if not math.isnan(column[index]):
                 return column[index]
             index -= 1
@@ -192,7 +192,7 @@ class FailsafeEvidence(Snapshot):
 class FlightLog:
     """One flight: time series and lists. Times are seconds since ``begins_at``.
 
-    What the log does not contain is an empty series, list or string.
+    An empty series, list or string means that the log does not contain the data.
     """
 
     path: Path
@@ -318,9 +318,9 @@ class FlightLog:
             self.armed[-1] = (begin_s, time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Record home, if it is valid. A known home is not changed after the first arming (plus two seconds).
+        """Record home, if it is valid.
 
-        Until arming, ArduPilot moves home with the vehicle.
+        Until the first arming, ArduPilot moves home with the vehicle. From two seconds after it, a known home is kept.
         """
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
         if not is_valid:  # NaN is not valid, because it fails the comparisons

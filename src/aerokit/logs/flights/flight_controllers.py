@@ -67,7 +67,7 @@ def close_bin(reader: Any) -> None:
             getattr(reader, name).close()
 
 
-States = tuple[tuple[str, Any], ...]
+StateValues = tuple[tuple[str, Any], ...]
 
 
 class _RowReader(LogReader):
@@ -123,7 +123,7 @@ def _position(latitude: float, longitude: float, amsl_m: float | None, relative_
     return None if latitude == longitude == 0 else position
 
 
-def _optional_state(name: str, value: object) -> States:
+def _optional_state(name: str, value: object) -> StateValues:
     return () if value is None else ((name, value),)
 
 
@@ -190,7 +190,7 @@ def _bin_system_id(reader: Any) -> int:
     return ardupilot_system_id(parameters)
 
 
-def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
+def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> StateValues:
     decode = _ARDUPILOT.get(table)
     try:
         return () if decode is None else decode(fields, reader)
@@ -198,7 +198,7 @@ def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> Sta
         return ()
 
 
-def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
+def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> StateValues:
     yaw = (fields["Yaw"] + 180) % 360 - 180
     return (
         ("attitude", Attitude(fields["Roll"], fields["Pitch"], yaw)),
@@ -211,14 +211,22 @@ def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _ardupilot_battery(fields: Mapping[str, Any]) -> States:
+def _px4_battery(row: Mapping[str, Any]) -> Battery:
+    remaining = row["remaining"]
+    percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
+    current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1 means unknown
+    voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0 means unknown
+    return Battery(id=0, voltage_v=voltage_v, current_a=current_a, remaining_percent=percent)
+
+
+def _ardupilot_battery(fields: Mapping[str, Any]) -> StateValues:
     number = fields.get("Instance", fields.get("Inst", 0))
     if number != 0:  # the state lists all batteries, but a row has only one, so only the first is used
         return ()
     return (("batteries", (Battery(number, _finite_or_none(fields["Volt"]), _finite_or_none(fields["Curr"])),)),)
 
 
-_ARDUPILOT: dict[str, Callable[[Mapping[str, Any], Any], States]] = {
+_ARDUPILOT: dict[str, Callable[[Mapping[str, Any], Any], StateValues]] = {
     "POS": lambda f, _: _optional_state("position", _position(f["Lat"], f["Lng"], f["Alt"], f["RelHomeAlt"])),
     "ATT": _ardupilot_attitude,
     "MSG": lambda f, _: _optional_state("status_text", _BinText(text=clean_text(f["Message"]))),
@@ -307,13 +315,13 @@ class _Px4States:
     def __init__(self) -> None:
         self._home_amsl_m: float | None = None
 
-    def states(self, table: str, row: Mapping[str, Any]) -> States:
+    def states(self, table: str, row: Mapping[str, Any]) -> StateValues:
         try:
             return self._states(table, row)
         except KeyError:  # the field has another name in this version of PX4
             return ()
 
-    def _states(self, table: str, row: Mapping[str, Any]) -> States:
+    def _states(self, table: str, row: Mapping[str, Any]) -> StateValues:
         if table == "home_position" and row.get("valid_alt", 1):
             self._home_amsl_m = row["alt"]
         elif table == "vehicle_global_position" and row.get("lat_lon_valid", 1):
@@ -330,12 +338,7 @@ class _Px4States:
         elif table == "vehicle_status":
             return (("armed", row["arming_state"] == 2),)  # ARMING_STATE_ARMED
         elif table == "battery_status":
-            remaining = row["remaining"]
-            percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
-            current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1 means unknown
-            voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0 means unknown
-            battery = Battery(id=0, voltage_v=voltage_v, current_a=current_a, remaining_percent=percent)
-            return (("batteries", (battery,)),)
+            return (("batteries", (_px4_battery(row),)),)
         elif table == "logged_messages":
             return (("status_text", StatusText(row["severity"], clean_text(row["message"]))),)
         return ()

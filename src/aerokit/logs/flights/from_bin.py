@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 import struct
 from collections import defaultdict
 from itertools import compress
@@ -82,9 +83,8 @@ class _Tables:
     def __init__(self, reader: Any) -> None:
         self._reader = reader
         self.began_us = self._first_time()
-        self._max_s = (
-            max((time_us for _, time_us in self._rows_at(-2)), default=math.inf) - self.began_us
-        ) / 1e6 + _MAX_LATE_S
+        second_to_last_us = max((time_us for _, time_us in self._rows_at(-2)), default=math.inf)
+        self._max_s = (second_to_last_us - self.began_us) / 1e6 + _MAX_LATE_S
         self.damaged: set[int] = set()
         """Offsets of the rows that were skipped because their time is impossible."""
 
@@ -140,19 +140,21 @@ class _Tables:
             chunk = [_scaled(unpacked[position], scale) for position, scale in zip(positions, scales, strict=True)]
             times_us, *values = chunk
             times = [(time_us - self.began_us) / 1e6 for time_us in times_us]
-            if times[-1] > self._max_s or not all(map(operator.le, times, times[1:])):
+            increases = all(map(operator.le, times, times[1:]))
+            if not increases or times[-1] > self._max_s:
                 kept = [self._is_plausible(times, row) for row in range(len(times))]
                 self.damaged.update(offsets[begin + row] for row, is_kept in enumerate(kept) if not is_kept)
                 times, *values = (list(compress(column, kept)) for column in (times, *values))
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        # Rows have no checksum. After a time that is too late, `TimeSeries` would use this time for all later rows.
+        # Rows have no checksum. `TimeSeries` would use a time that is too late for all later rows, too.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time
         is_outlier = time > after + _MAX_DISORDER_S or time < before - _MAX_DISORDER_S
-        return time <= self._max_s and not (is_outlier and 0.0 <= before <= after + _MAX_DISORDER_S)
+        neighbours_agree = 0.0 <= before <= after + _MAX_DISORDER_S  # otherwise one of them may be the outlier
+        return time <= self._max_s and not (is_outlier and neighbours_agree)
 
     def _first_time(self) -> int:
         # Use the row that is first in the file. The row with the lowest time could be a damaged one.
@@ -181,14 +183,7 @@ class _Tables:
 
 def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
     """Return the struct layout of rows in which all columns except ``indices`` are padding."""
-    codes, begin = [], 1  # the layout begins with "<"
-    layout = row_format.msg_struct
-    while begin < len(layout):
-        end = begin
-        while layout[end].isdigit():
-            end += 1
-        codes.append(layout[begin : end + 1])
-        begin = end + 1
+    _, *codes = re.findall(r"\d*\D", row_format.msg_struct)  # "<Qf64s" has the codes "Q", "f" and "64s"
     padded = [code if index in indices else f"{struct.calcsize('<' + code)}x" for index, code in enumerate(codes)]
     return "<" + "".join(padded)
 
@@ -301,10 +296,11 @@ class _Reader:
             return
         # If the estimator has no positions, use those of the first GPS receiver that has a 3D fix.
         number_column = ("I",) if self._tables.has("GPS", "I") else ()
-        used_receiver = None
-        for time, status, latitude, longitude, amsl, *receiver in self._tables.rows(
+        used_receiver: int | None = None
+        for time, status, latitude, longitude, amsl, *number in self._tables.rows(
             "GPS", "Status", "Lat", "Lng", "Alt", *number_column
         ):
+            receiver = number[0] if number_column else 0
             if status >= GpsFixType.TYPE_3D_FIX and used_receiver in (None, receiver):
                 used_receiver = receiver
                 track.add(time, latitude, longitude, amsl, NAN)
@@ -323,7 +319,7 @@ class _Reader:
         self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
 
     def _read_targets(self) -> None:
-        # The log has positions relative to the estimator's origin.
+        # The set-points (PSCN, PSCE) are relative to the estimator's origin.
         origin = self._origin()
         plane = None if origin is None else TangentPlane(*origin)
         east = TimeSeries("m", "m_s")
@@ -331,9 +327,7 @@ class _Reader:
             east.add(*row)
         for time, north_m, north_m_s in self._tables.rows("PSCN", "TPN", "TVN"):
             # The rows of one set-point are logged together. One of them may be lost.
-            east_m, east_m_s = (
-                east.at(name, time + _SAME_SETPOINT_S, not_older_s=2 * _SAME_SETPOINT_S) for name in east
-            )
+            east_m, east_m_s = (east.at(name, time + _SAME_SETPOINT_S, max_age_s=2 * _SAME_SETPOINT_S) for name in east)
             if plane is not None and not math.isnan(east_m):
                 latitude, longitude = plane.degrees(north_m, east_m)
                 self._flight.position_target.add(time, latitude, longitude, NAN, NAN)  # _add_heights() adds altitudes

@@ -26,7 +26,7 @@ from aerokit.vehicle.state.movement import Attitude
 from aerokit.vehicle.state.status_text import StatusTextAssembler
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.logs.flights.flight import FlightLog
     from aerokit.mavlink.message import Message
@@ -41,7 +41,7 @@ _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 # If a record is earlier than the previous one by more than this, the recording's clock was set back.
 _MAX_DISORDER_S = 1.0
 # A record is skipped as damaged if its time differs from the previous record's by more than this. If the next record
-# has a similar time, the time is right.
+# has about the same time as the skipped one, the clock has jumped, and reading continues with the new time.
 _DOUBTFUL_JUMP_S = 3600.0
 # If no HEARTBEAT arrives for longer than this, the arming state is unknown.
 _MAX_HEARTBEAT_INTERVAL_S = 5.0
@@ -152,11 +152,12 @@ class _Reader:
                 elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
                     step_s = unix_s - previous_unix_s
                     if abs(step_s) > _DOUBTFUL_JUMP_S:
-                        if abs(unix_s - doubtful_unix_s) > _DOUBTFUL_JUMP_S:
+                        is_like_skipped = abs(unix_s - doubtful_unix_s) <= _DOUBTFUL_JUMP_S
+                        if not is_like_skipped:
                             doubtful_unix_s = unix_s
                             damaged += 1
                             continue
-                        damaged -= 1  # the skipped record was right
+                        damaged -= 1  # the skipped record was not damaged
                     if step_s > 0:
                         paused_s += step_s
                     else:
@@ -239,9 +240,8 @@ class _Reader:
         if setpoints.has("latitude_deg"):
             return
         has_heights = setpoints.has()  # NAV_CONTROLLER_OUTPUT has heights without positions
-        rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints.names), strict=True))
-        columns = (destinations[name] for name in destinations.names)
-        for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
+        rows = list(_rows_of(setpoints))
+        for time, latitude, longitude, amsl, relative in _rows_of(destinations):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
         merged = TimeSeries(*setpoints.names)
@@ -324,11 +324,13 @@ class _Reader:
 
     def _note_missing_heartbeats(self) -> None:
         self._end_heartbeat_gap(self._flight.duration_s)
-        # Do not count silences, in which no message arrived: the report describes them separately.
-        missing_s = sum(
-            end - begin - sum(max(min(end, s.ends_s) - max(begin, s.begins_s), 0.0) for s in self._flight.silences)
-            for begin, end in self._armed_gaps
-        )
+
+        def silent_s(begin_s: float, end_s: float) -> float:
+            overlaps = (min(end_s, s.ends_s) - max(begin_s, s.begins_s) for s in self._flight.silences)
+            return sum(max(overlap_s, 0.0) for overlap_s in overlaps)
+
+        # The report describes silences, in which no message at all arrived, separately.
+        missing_s = sum(end - begin - silent_s(begin, end) for begin, end in self._armed_gaps)
         if missing_s > _MAX_HEARTBEAT_INTERVAL_S:
             self._flight.notes.append(
                 f"for {missing_s:.0f} s, other messages arrived, but no HEARTBEAT: this time counts as armed, although"
@@ -396,7 +398,7 @@ class _Reader:
 
     def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
-            # The yaw is NaN, because `nav_bearing` is no yaw of the vehicle, but the course of a fixed wing.
+            # The yaw is NaN, because a fixed wing reports its course in `nav_bearing`, not a yaw.
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
             if -180 <= message.nav_bearing <= 360 and not math.isnan(self._relative_m):
                 self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)
@@ -492,6 +494,11 @@ class _Reader:
 
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
+
+
+def _rows_of(series: TimeSeries) -> Iterator[tuple[float, ...]]:
+    """Yield the time and the values of each row."""
+    return zip(series.times, *(series[name] for name in series.names), strict=True)
 
 
 def _message_id_bytes(kind: type[Message]) -> bytes:

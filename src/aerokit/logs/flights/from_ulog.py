@@ -416,8 +416,9 @@ def _drop_damaged_rows(topics: list[Any]) -> int:
         before, after = numpy.append(times[:1], times[:-1]), numpy.append(times[1:], times[-1:])
         # Rows have no checksum. A time is impossible if it is far outside the neighbours' times, or far after the end
         # of the log.
-        is_spike = (times > after + _MAX_DISORDER_US) | (times < before - _MAX_DISORDER_US)
-        is_damaged = is_spike & (before <= after + _MAX_DISORDER_US) | (times > last_us + _MAX_LATE_US)
+        is_outlier = (times > after + _MAX_DISORDER_US) | (times < before - _MAX_DISORDER_US)
+        neighbours_agree = before <= after + _MAX_DISORDER_US  # otherwise one of them may be the outlier
+        is_damaged = (is_outlier & neighbours_agree) | (times > last_us + _MAX_LATE_US)
         if is_damaged.any():
             damaged += int(is_damaged.sum())
             topic.data = {name: values[~is_damaged] for name, values in topic.data.items()}

@@ -19,7 +19,8 @@ MIN_SILENCE_S = 3.0
 """Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 
 # If the clocks drift apart by more than _MAX_CLOCK_DRIFT (0.2 is 20 %), the vehicle is a simulation that did not run in
-# real time. In less than _MIN_CLOCK_COMPARISON_S, the delays of the link would distort the comparison.
+# real time. In less than _MIN_CLOCK_COMPARISON_S, the delays of the link would distort the comparison. The comparison
+# treats an interval between two messages as long from _MAX_CLOCK_GAP_S on.
 _MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
 
 
@@ -53,7 +54,7 @@ class ClockComparison:
     def speed(self) -> float:
         """Seconds by which the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
         recorded_s, vehicle_s = self._recorded_s, self._vehicle_s
-        if not self._is_comparable:
+        if not self._is_comparable:  # A fast simulation may have only long intervals.
             recorded_s, vehicle_s = recorded_s + self._long_recorded_s, vehicle_s + self._long_vehicle_s
             if min(recorded_s, vehicle_s) < _MIN_CLOCK_COMPARISON_S:
                 return 1.0
@@ -97,8 +98,8 @@ class LinkCounter:
         if time_s >= self._second + 1:  # this frame is the first one of a new second
             self._received += received - 1
             received = 1
-            if int(time_s) - self._second > 1:  # _add_row() records the seconds without frames as 100 % loss
-                missing = 0
+            if int(time_s) - self._second > 1:
+                missing = 0  # _add_row() already shows the seconds between as 100 % loss
             self._add_row(int(time_s))
         self._received += received
         self._lost += missing
@@ -109,13 +110,13 @@ class LinkCounter:
         is_recorded = ends_s - begins_s - paused_s >= MIN_SILENCE_S
         self._silences.append(Silence(begins_s, ends_s, is_recorded))
 
-    def end(self, received: int, received_s: float, ends_s: float, paused_s: float) -> None:
-        """Count the last frames, and record a silence from ``received_s`` to the end of the log."""
+    def end(self, received: int, last_frame_s: float, ends_s: float, paused_s: float) -> None:
+        """Count the last frames, and record a silence from the last frame to the end of the log."""
         self._received += received
-        if ends_s - received_s < MIN_SILENCE_S:
+        if ends_s - last_frame_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
             return
-        self.add_silence(received_s, ends_s, paused_s)
+        self.add_silence(last_frame_s, ends_s, paused_s)
         self._add_row(int(ends_s))
         if ends_s > self._second:
             self._series.add(ends_s, *_ALL_LOST)
@@ -124,7 +125,7 @@ class LinkCounter:
         """Add a row for the counted second, and start to count ``second``."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        # No frames arrived in the seconds between. Rows for the first and the last of them show a loss of 100 %.
+        # No frames arrived in the seconds between these two. The first and the last of them get a row.
         if second - self._second > 1:
             self._series.add(self._second + 1, *_ALL_LOST)
             self._series.add(second - 1, *_ALL_LOST)
@@ -137,7 +138,7 @@ def is_real_time(speed: float) -> bool:
 
 
 def use_simulated_time(flight: FlightLog, speed: float) -> None:
-    """Convert all times to the vehicle's seconds, if the vehicle is a simulation at another speed."""
+    """Convert all times to the vehicle's seconds, if the vehicle is a simulation that did not run in real time."""
     if is_real_time(speed):
         return
     recorded_s = flight.duration_s

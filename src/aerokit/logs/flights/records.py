@@ -127,16 +127,20 @@ class TlogReader(LogReader):
                 self._autopilots[system_id] = component_id, autopilot_for(message)
         elif isinstance(message, AutopilotVersion):
             self._capabilities[system_id, component_id] = message.capabilities
-        elif isinstance(message, (ParamValue, ParamSet)):
-            if isinstance(message, ParamSet):
-                system_id, component_id = message.target_system, message.target_component
-            autopilot_id, autopilot = self._autopilots.get(system_id, (0, None))
-            # Other components' values stay as they were sent, because their encoding is unknown.
-            if autopilot is not None and component_id in (0, autopilot_id):  # 0 means all components
-                capabilities = self._capabilities.get((system_id, autopilot_id))
-                value = value_of(message, autopilot.encodes_parameters_bytewise(capabilities))
-                return type(message)(**{**message.to_dict(), "param_value": float(value)})
+        elif isinstance(message, ParamValue):
+            return self._decoded(message, system_id, component_id)
+        elif isinstance(message, ParamSet):
+            return self._decoded(message, message.target_system, message.target_component)
         return message
+
+    def _decoded(self, message: ParamValue | ParamSet, system_id: int, component_id: int) -> Message:
+        autopilot_id, autopilot = self._autopilots.get(system_id, (0, None))
+        # Other components' values stay as they were sent, because their encoding is unknown.
+        if autopilot is None or component_id not in (0, autopilot_id):  # 0 means all components
+            return message
+        capabilities = self._capabilities.get((system_id, autopilot_id))
+        value = value_of(message, autopilot.encodes_parameters_bytewise(capabilities))
+        return type(message)(**{**message.to_dict(), "param_value": float(value)})
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         assert entry.message is not None

@@ -54,13 +54,15 @@ class RecordedMission:
             return
         elif isinstance(message, m.MissionClearAll):
             self._is_clearing = True
-        elif isinstance(message, m.MissionAck):  # ArduPilot refuses to clear a mission that it flies.
+        elif isinstance(message, m.MissionAck):
             if self._is_clearing and sender == self._system_id:
                 self._is_clearing = False
+                # ArduPilot refuses to clear a mission that it flies.
                 if message.type == MavMissionResult.ACCEPTED:
                     self._items.clear()
-        elif isinstance(message, m.MissionCount):  # Items beyond this number belong to an earlier mission.
+        elif isinstance(message, m.MissionCount):
             self._is_clearing = False  # The next MISSION_ACK is about this transfer, not about clearing.
+            # Items beyond this number belong to an earlier mission.
             self._items = {number: item for number, item in self._items.items() if number < message.count}
         elif message.current not in _NO_MISSION_ITEM:
             self._add(message)

@@ -69,7 +69,7 @@ class RecordedModeCommands:
         self._flight.modes = changes
 
     def _command_age_s(self, change: ModeChange, mode: str) -> float:
-        """Return how many seconds before the change this mode was last ordered; infinity if it was never ordered."""
+        """Return the seconds from the last order of ``mode`` to the change; infinity if ``mode`` was not ordered."""
         times = self._command_times.get(mode, [])
         index = bisect_right(times, change.time_s)
         return change.time_s - times[index - 1] if index else math.inf

@@ -15,7 +15,7 @@ from aerokit.logs.flights.falls import falls
 from aerokit.logs.report.charts import COLOURS, timeline_shapes
 from aerokit.logs.report.comparing import NAMES, comparison
 from aerokit.logs.report.formatting import date
-from aerokit.logs.report.page import page
+from aerokit.logs.report.page import Summary, page
 from aerokit.logs.report.sections import SECTIONS
 from aerokit.logs.report.statistics import FlightStatistics, findings, statistics_of, summary
 
@@ -52,7 +52,7 @@ def write_report(
     force: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Report:
-    """Write a report on a flight, or a comparison of two flights, as one HTML file that loads nothing.
+    """Write a report on a flight, or a comparison of two flights, as one HTML file without external resources.
 
     The file gets its name only when it is complete. The function blocks; it needs no event loop.
 
@@ -104,16 +104,16 @@ def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summar
         (flight,) = flights
         optional_sections = [make_section(flight) for make_section in SECTIONS]
         sections = [section for section in optional_sections if section is not None]
-        headed_summary = (_heading(flight), summaries[0], findings(flight))
-        return page(flight.path.name, [headed_summary], sections, COLOURS, shapes=timeline_shapes(flight))
+        page_summary = Summary(_heading(flight), summaries[0], findings(flight))
+        return page(flight.path.name, [page_summary], sections, COLOURS, shapes=timeline_shapes(flight))
     first, second = flights
-    headed_summaries = [
-        (f"{name}: {flight.path.name}, {_heading(flight)}", sentences, findings(flight))
+    page_summaries = [
+        Summary(f"{name}: {flight.path.name}, {_heading(flight)}", sentences, findings(flight))
         for name, flight, sentences in zip(NAMES, flights, summaries, strict=True)
     ]
     first_statistics, second_statistics = statistics
     sections = comparison((first, second), (first_statistics, second_statistics))
-    return page(f"{first.path.name} and {second.path.name}", headed_summaries, sections, COLOURS)
+    return page(f"{first.path.name} and {second.path.name}", page_summaries, sections, COLOURS)
 
 
 def _heading(flight: FlightLog) -> str:

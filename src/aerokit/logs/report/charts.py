@@ -88,10 +88,11 @@ def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float]
 
 
 def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[int]:
-    """Select about ``max_rows`` rows, so that a chart of them shows all peaks and the longer gaps."""
+    """Select about ``max_rows`` rows with which a chart still shows all peaks and the longer gaps."""
     count = len(values)
     if count <= max_rows:
         return list(range(count))
+    # From each of `pieces` parts of equal length, draw the lowest and the highest value.
     pieces = max(max_rows // 2, 1)
     selected = {0, count - 1}
     for piece in range(pieces):
@@ -156,6 +157,7 @@ def time_range(begin_s: float, end_s: float) -> list[float]:
 
 
 def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
+    # The shapes are SVG paths over the whole height, 0 to 1: rectangles for modes, vertical lines for events.
     spans: dict[str, list[str]] = {}
     for change, end in flight.mode_spans():
         band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
@@ -247,7 +249,8 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     rows_by_mode: dict[str, list[int | None]] = {}  # None interrupts the line
     for (start, end), change in zip(pairwise(boundaries), changes, strict=True):
         # The line of a mode ends at the first position of the next mode, so that the track has no gaps.
-        part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
+        first, last = bisect_left(rows, start), bisect_left(rows, end)
+        part = rows[first : last + 1] if start < end else []
         if part:
             mode_rows = rows_by_mode.setdefault(change.name, [])
             if mode_rows:  # the mode was used before

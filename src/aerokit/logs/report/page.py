@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import import_module, resources
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from aerokit._internal.formatting import printable
 
@@ -63,7 +63,15 @@ class Chart:
     """True for a chart over time. All these charts have the page's shapes as background, and zoom together."""
 
 
-Summary: TypeAlias = "tuple[str, Sequence[str], Sequence[str]]"
+class Summary(NamedTuple):
+    """The sentences about one flight, below a heading."""
+
+    heading: str
+    sentences: Sequence[str]
+    findings: Sequence[str]
+    """The sentences to emphasise."""
+
+
 Part: TypeAlias = "Paragraphs | Table | Collapsed | Chart"
 MAX_OPEN_ROWS = 15
 """Tables with more rows than this are collapsed."""
@@ -93,8 +101,8 @@ def page(
 ) -> str:
     """Return the HTML of the whole page.
 
-    A summary has a heading, the sentences about a flight, and the sentences to emphasise. ``colours`` maps themes
-    ("light", "dark") to colours by name. ``shapes`` are Plotly's shapes for the background of all timelines.
+    ``colours`` maps themes ("light", "dark") to colours by name. ``shapes`` are Plotly's shapes for the background of
+    all timelines.
 
     Raises:
         ModuleNotFoundError: plotly is not installed.

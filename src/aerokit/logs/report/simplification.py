@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -15,6 +15,18 @@ if TYPE_CHECKING:
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
 """Larger coordinates are damaged data. They are ignored, because their squares could overflow."""
+
+
+class _Segment(NamedTuple):
+    """A line segment from the point ``first`` to the point ``last``, which replaces the points between them.
+
+    heapq returns the smallest item first, so the square of the largest deviation is negative.
+    """
+
+    negative_square: float
+    farthest: int  # index of the point with the largest deviation
+    first: int
+    last: int
 
 
 def simplify(
@@ -31,8 +43,8 @@ def simplify(
         keep: indices that are selected if their coordinates are known.
 
     Returns:
-        The selected indices, with one index for each gap, and the largest distance of an omitted point from the line
-        through the selected points.
+        The indices of the selected points and of one NaN for each gap, and the largest distance of an omitted point
+        from the line through the selected points.
     """
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):
@@ -46,35 +58,28 @@ def simplify(
             selected.add(index)
         elif not is_known and index and known[index - 1]:
             gaps.append(index)
-    # A heap of segments: (negative square of the largest deviation, index of this point, first index, last index).
-    # heapq returns the smallest item first, so the square is negative.
     segments = [
-        (*_deviation(places, first, last), first, last)
+        _segment(places, first, last)
         for first, last in pairwise(sorted(selected))
         if last - first > 1 and known[first + 1]
     ]
     heapq.heapify(segments)
     while segments and len(selected) < max_points:
-        negative_square, middle, first, last = segments[0]
+        negative_square, middle, first, last = segments[0]  # the segment with the largest deviation
         if negative_square >= -tolerance * tolerance:  # All deviations are within the tolerance.
             break
         heapq.heappop(segments)
         selected.add(middle)
         for begin, end in ((first, middle), (middle, last)):
             if end - begin > 1:
-                heapq.heappush(segments, (*_deviation(places, begin, end), begin, end))
+                heapq.heappush(segments, _segment(places, begin, end))
     largest_deviation = 0.0
     if segments:
-        negative_square, *_ = segments[0]
-        largest_deviation = math.sqrt(-negative_square)
+        largest_deviation = math.sqrt(-segments[0].negative_square)
     return sorted({*selected, *gaps}), largest_deviation
 
 
-def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> tuple[float, int]:
-    """Find the point between ``first`` and ``last`` that is farthest from the line segment between them.
-
-    Return the negative square of its distance, and its index.
-    """
+def _segment(places: Sequence[tuple[float, float]], first: int, last: int) -> _Segment:
     x, y = places[first]
     last_x, last_y = places[last]
     segment_x, segment_y = last_x - x, last_y - y
@@ -90,4 +95,4 @@ def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> 
         squared_distance = dx * dx + dy * dy
         if squared_distance > largest:
             largest, largest_index = squared_distance, index
-    return -largest, largest_index
+    return _Segment(-largest, largest_index, first, last)

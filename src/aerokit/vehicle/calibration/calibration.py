@@ -78,8 +78,8 @@ class Calibration(AsyncIterator["CalibrationStep"]):
     async def cancel(self) -> None:
         """Cancel the calibration, and return when the vehicle has confirmed the end.
 
-        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps: a
-        loop that waits for the next step in another task ends.
+        Sends nothing if the calibration has not started or has ended. The iterator ends in any case, also for a task
+        that is waiting for the next step.
 
         Raises:
             NotSupported: the vehicle cannot cancel this calibration.
@@ -124,16 +124,16 @@ class CalibrationControl:
     def compass(self) -> Calibration:
         """Calibrate all compasses, while a person turns the vehicle about all its axes.
 
-        ArduPilot reports progress and fitness of each compass; reboot it afterwards. PX4 asks for up to six poses,
-        and for a turn about the vertical axis in each.
+        ArduPilot reports progress and fitness of each compass, and must be rebooted afterwards. PX4 asks for up to six
+        poses, and for a turn about the vertical axis in each.
         """
         return self._prepare("compass", procedures.ardupilot_compass, command_param=2)
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
 
-        ArduPilot waits for a confirmation in each pose; reboot it afterwards. PX4 detects the poses itself, in any
-        order.
+        ArduPilot waits for a confirmation in each pose, and must be rebooted afterwards. PX4 detects the poses itself,
+        in any order.
         """
         return self._prepare("accelerometer", procedures.ardupilot_accelerometer, command_param=5)
 
@@ -191,8 +191,8 @@ class CalibrationControl:
     ) -> Calibration:
         """Return a calibration that has not started yet.
 
-        ``command_param`` is the number, from 1, of the MAV_CMD_PREFLIGHT_CALIBRATION parameter that becomes
-        ``param_value``. 0: the procedure needs no parameters.
+        ``command_param`` is the number (from 1) of the MAV_CMD_PREFLIGHT_CALIBRATION parameter that is set to
+        ``param_value``; 0 if the procedure needs no parameters.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"

@@ -30,8 +30,8 @@ CALIBRATE_AT_BOOT = 3
 END_GRACE_S = 3.0
 # Maximum seconds for restoring a parameter, because a cancelled call must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request for a pose every second until it receives our confirmation. The same request is ignored
-# for this many seconds after the confirmation, because it may have been sent before.
+# ArduPilot repeats its request for a pose every second until it receives our confirmation. After the confirmation, the
+# same request is ignored for this many seconds, because ArduPilot may have sent it before the confirmation arrived.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
@@ -327,9 +327,9 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         low, high, trim = lows[number], highs[number], trims.get(number, 0)
         if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
             raise run.failure(
-                f"channel {number} ranges from {low} to {high} µs with a center of {trim} µs; its ends must be on both"
-                f" sides of {MIDDLE_US} µs, from {LOWEST_US} to {HIGHEST_US} µs, with the center between them; nothing"
-                " was written"
+                f"channel {number} ranges from {low} to {high} µs with a center of {trim} µs; its minimum must be from"
+                f" {LOWEST_US} to {MIDDLE_US} µs, its maximum from {MIDDLE_US} to {HIGHEST_US} µs, and its center"
+                " between them; nothing was written"
             )
         values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}
     async with run.parameters().transaction() as transaction:

@@ -64,12 +64,12 @@ class CalibrationRun:
         self._cannot_cancel_reason = ""  # why the calibration cannot be cancelled, for the user; empty if it can be
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
-        # Holds the order that cancels the calibration. The arbiter keeps this order until the stack is closed.
+        # Closed when the calibration ends: removes the callbacks, and the order that cancels the calibration.
         self._cleanup = ExitStack()
         self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
         self._is_abandoned = False
-        # True from the first cancel command on, until the vehicle has confirmed the cancellation.
+        # True from `abandon` on, until the vehicle has confirmed the cancellation.
         self._is_unconfirmed = False
         self._ended = asyncio.Event()  # set once the calibration has ended on the vehicle
 
@@ -128,7 +128,7 @@ class CalibrationRun:
         """Record that the vehicle has ended the calibration."""
         if not self._ended.is_set():
             self._ended.set()
-            self._cleanup.close()  # If a cancel command was sent, it is not sent again after this.
+            self._cleanup.close()
             if self in self._runs:
                 self._runs.remove(self)
 
@@ -192,12 +192,11 @@ class CalibrationRun:
                 if must_send:
                     # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                     await self.session.wait_for_heartbeat(self._cancel_sent_at)
-                    is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
                     if self._has_rebooted:  # The reboot has ended the calibration.
                         self._is_unconfirmed = False
                         return
+                    is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
                     if is_taken_over:  # The command might disturb the other party.
-                        self._is_unconfirmed = True
                         return
                     if not self.context.arbiter.is_state_recent:
                         continue
@@ -218,11 +217,11 @@ class CalibrationRun:
         if self._has_rebooted:
             return True
         assert self._cancel_sent_at is not None
-        # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
             return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
+        # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if self.session.autopilot.calibration_protocol != "texts":
-            # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp), so any answer confirms it.
+            # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp). So any answer is a confirmation.
             return self.session.commands.last_result(int(cancel_command)) is not None
         # PX4 acknowledges PREFLIGHT_CALIBRATION twice, with different results, so its HEARTBEAT is the confirmation.
         status = self.session.telemetry.system_status
@@ -240,7 +239,7 @@ class CalibrationRun:
         timeout: float = REPORT_TIMEOUT_S,
         timeout_text: str = "the vehicle reported nothing about the calibration",
     ) -> None:
-        """Wait until ``is_ready`` returns a true value. Raises as `await_progress`."""
+        """Wait until ``is_ready`` returns a true value. Raises the errors of `await_progress`."""
         await await_progress(
             self.session,
             self.call_name,

@@ -106,7 +106,7 @@ ATTEMPT_TIMEOUT_S, REQUEST_ATTEMPTS = 1.0, 3
 
 @checks_arguments
 class Component(ReadOnly):
-    """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
+    """One component of a vehicle, for example a camera, a gimbal or a companion computer.
 
     Returned by :meth:`aerokit.Vehicle.component`. Commands, messages, rates, parameters and files of the component work
     like those of the autopilot. https://mavlink.io/en/services/component_information.html
@@ -262,7 +262,7 @@ class Component(ReadOnly):
             with anyio.move_on_after(timeout):
                 commands = self._session.commands
                 for attempts_left in reversed(range(REQUEST_ATTEMPTS)):
-                    is_doubtful = commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, self.component_id)
+                    may_get_late_ack = commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, self.component_id)
                     try:
                         await commands.send_long(
                             MavCmd.REQUEST_MESSAGE,
@@ -275,11 +275,14 @@ class Component(ReadOnly):
                         pass
                     except CommandRejected as error:
                         # If the refusal may belong to an earlier request, it counts only after the last attempt.
-                        refusal = None if is_doubtful and attempts_left else error
-                    # After a refusal, return only a message that has arrived already. After the last request, wait
-                    # until the time-out.
-                    limit_s = ATTEMPT_TIMEOUT_S if attempts_left else math.inf
-                    with anyio.move_on_after(limit_s if refusal is None else 0):
+                        refusal = None if may_get_late_ack and attempts_left else error
+                    if refusal is not None:
+                        wait_s = 0.0  # Return the message only if it has arrived already.
+                    elif attempts_left:
+                        wait_s = ATTEMPT_TIMEOUT_S
+                    else:
+                        wait_s = math.inf  # `timeout` ends the wait after the last request.
+                    with anyio.move_on_after(wait_s):
                         async for answer in answers:
                             if where is None or where(answer):
                                 return answer
@@ -304,7 +307,7 @@ class Component(ReadOnly):
         return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz)
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Return the state value of the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with the component's latest message of a type, like :meth:`aerokit.Vehicle.message`."""
         return self._session.subscriber.cell(message_type, rate_hz)
 
     @contextmanager

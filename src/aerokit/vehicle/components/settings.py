@@ -60,7 +60,7 @@ class Settings:
     ) -> None:
         self._transfers = session.transfers
         self._request_information = information
-        # Returns the files of the component with this id.
+        # Returns the files of the component with the given id.
         self._files_of = files_of
         self._known: dict[str, Setting] = {}
         self._missing: set[str] = set()  # names of settings that the component does not have
@@ -167,7 +167,7 @@ class Settings:
         return MappingProxyType({option.name: option.value for option in options})
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """Return the selected options that exclude a setting, for example ``("CAM_EXPMODE = Auto",)``."""
+        """Return the options of other settings that exclude a setting now, for example ``("CAM_EXPMODE = Auto",)``."""
         return () if self._definition is None else self._definition.excluded_by(name, self._values())
 
     async def download(
@@ -178,11 +178,13 @@ class Settings:
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Mapping[str, Setting]:
-        """Return all settings by name, in the component's order; immediately if they were downloaded before.
+        """Return all settings by name, in the component's order. Download them if they are not complete yet.
+
+        ``refresh`` downloads them in any case.
 
         Raises:
-            ParameterTimeout: the list is incomplete, or the component has no settings; ``table`` has those that
-                arrived.
+            ParameterTimeout: the list is incomplete, or the component has no settings. The error's ``table`` has the
+                settings that arrived.
         """
         transfers = self._transfers
         with transfers.limit(timeout):
@@ -199,9 +201,9 @@ class Settings:
                     listed = await transfers.run(exchange)
                     if self._reboots != reboots_before:
                         continue  # A part of the list is from before the reboot.
-                    unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
-                    # Prefer the values in `_known`: `_store` has also recorded the messages during the download.
-                    self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
+                    # The order is the component's. The values in `_known` take precedence, because `_store` has also
+                    # recorded the messages during the download.
+                    self._known = {**listed, **self._known}
                     self._is_complete = True
                     break
                 return self.table
@@ -235,8 +237,9 @@ class Settings:
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        If the camera definition is loaded, ``value`` may be the name of an option. Unknown settings that restrict this
-        setting are then read first. Settings that the camera may have changed are read again afterwards.
+        If the camera definition is loaded, ``value`` may be the name of an option. aerokit then first reads the
+        settings that restrict this one, if their values are unknown. Afterwards, it reads the settings that the camera
+        may have changed.
 
         Raises:
             InvalidArgument: the name or value is invalid, or the definition does not allow this value now. Nothing was

@@ -397,12 +397,11 @@ def _triangle(linear_variance: float | None, angular_variance: float | None) -> 
     triangle = [0.0] * TRIANGLE_SIZE
     for indexes, variance in ((POSITION_DIAGONAL, linear_variance), (ORIENTATION_DIAGONAL, angular_variance)):
         for index in indexes:
-            # An unknown angular variance is sent as 0, for which both autopilots use the minimum in their parameters.
-            # ArduPilot does not accept NaN here.
+            # For a variance of 0, both autopilots use the minimum in their parameters. So 0 is sent for an unknown
+            # angular variance, for which ArduPilot does not accept NaN.
             triangle[index] = variance or 0.0
     if linear_variance is None:
-        # NaN in the first element means that the linear variance is unknown.
-        triangle[0] = NAN
+        triangle[0] = NAN  # The linear variance is unknown.
     return triangle
 
 

@@ -71,7 +71,7 @@ class External:
         return self._stream("motion_capture", PoseMeasurement, self._encode.motion_capture, rate_hz, valid_for_s)
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
-        """Supply a satellite position (GPS_INPUT). Set GPS1_TYPE to 14 on ArduPilot; PX4 does not read GPS_INPUT."""
+        """Supply positions from a satellite receiver (GPS_INPUT). Only ArduPilot reads them: set GPS1_TYPE to 14."""
         return self._stream("gps", GpsMeasurement, self._encode.gps, rate_hz, valid_for_s)
 
     def obstacles(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstacleSectors]:
@@ -86,7 +86,10 @@ class External:
         return self._stream("obstacle_points", ObstaclePoints, self._encode.obstacle_points, rate_hz, valid_for_s)
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
-        """Supply a distance (DISTANCE_SENSOR). On ArduPilot, set RNGFND1_TYPE to 10 and RNGFND1_ORIENT to match."""
+        """Supply a distance (DISTANCE_SENSOR).
+
+        On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT to the direction of the sensor.
+        """
         return self._stream("range_finder", RangeMeasurement, self._encode.range_finder, rate_hz, valid_for_s)
 
     def landing_target(
@@ -113,10 +116,10 @@ class External:
         speed_accuracy_m_s: float = 1.0,
         direction_accuracy_deg: float = 15.0,
     ) -> None:
-        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Returns when the vehicle acknowledges it.
+        """Supply an estimate of the wind (MAV_CMD_EXTERNAL_WIND_ESTIMATE). Wait until the vehicle acknowledges it.
 
-        No message reports whether the vehicle uses it. ArduPilot uses the wind in its simpler estimator (DCM), PX4 in
-        EKF2.
+        No message reports whether the vehicle uses the estimate. ArduPilot uses it in its simpler estimator (DCM), PX4
+        in EKF2.
 
         Args:
             speed_m_s: horizontal speed, 0 to 100.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
 from collections.abc import AsyncGenerator, AsyncIterable, Awaitable, Callable
 from inspect import isawaitable
@@ -56,9 +55,10 @@ class TargetLoss(Snapshot):
 class LandingReport(Snapshot):
     """Report of a precision landing, made when the vehicle is on the ground and disarmed.
 
-    ``last_target`` is the last measurement, and ``unseen_s`` its age at the end: a camera rarely sees the target from
-    close by. ``losses`` are the earlier periods of more than a second in which the target was not visible.
-    ``climbed_m`` is how far the vehicle climbed during the landing, in a retry of ArduPilot or a search of PX4.
+    ``last_target`` is the last measurement. ``unseen_s`` is its age at the end, usually above 0, because a camera
+    rarely sees the target from close by. ``losses`` are the periods of more than a second after which the target was
+    visible again. ``climbed_m`` is how far the vehicle climbed during the landing, in a retry of ArduPilot or a search
+    of PX4.
     ``used_target`` is False if no measurement was sent during the descent; the vehicle then landed where its firmware
     chose. ``texts`` are the vehicle's status texts since the order.
     """
@@ -121,7 +121,7 @@ class TargetLanding:
         self._lowest_m = math.inf
         self._climbed_m = 0.0
         self._losses: list[TargetLoss] = []
-        # The exception of the program's source; None if it has not failed.
+        # The exception that the program's source of measurements has raised.
         self._source_error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
@@ -194,13 +194,14 @@ class TargetLanding:
         if target is None:
             return
         check_kind("target", target, TargetMeasurement)
-        # Without PX4's attitude or local position, the target cannot be converted, so it is not sent. The target then
-        # counts as not visible.
-        with contextlib.suppress(ValueUnknownError):
+        try:
             self._stream.send(target)
-            unseen_s = self._now() - self._seen_at
-            if LOST_AFTER_S < unseen_s < math.inf:
-                self._losses.append(TargetLoss(unseen_s, self._seen_height_m))
-            self._last = target
-            self._seen_at = self._now()
-            self._seen_height_m = height_above_home(self._session.telemetry)
+        except ValueUnknownError:
+            # Without PX4's attitude or local position, the target cannot be converted. It counts as not visible.
+            return
+        unseen_s = self._now() - self._seen_at
+        if LOST_AFTER_S < unseen_s < math.inf:
+            self._losses.append(TargetLoss(unseen_s, self._seen_height_m))
+        self._last = target
+        self._seen_at = self._now()
+        self._seen_height_m = height_above_home(self._session.telemetry)

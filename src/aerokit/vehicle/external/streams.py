@@ -241,16 +241,15 @@ class MeasurementStream(Generic[MeasurementT]):
         values = await known_values(self._probe, *required_names, *(name for name, _ in rule.sole_source))
         for names, allowed in rule.required:  # ``names`` are the names of one parameter in several firmware versions.
             present_name = next((name for name in names if name in values), None)
-            if present_name is not None and values[present_name] in allowed:
-                continue
             if present_name is None:
                 raise OperationRejected(
-                    f"{measurement}: this build of {firmware} ignores the measurements, because it has no"
+                    f"{measurement}: this build of {firmware} ignores the measurements, because it has no parameter"
                     f" {' or '.join(names)}"
                 )
-            choices = " or ".join(f"{value:g}" for value in allowed[:4])
-            raise OperationRejected(
-                f"{measurement}: {present_name} = {values[present_name]:g}, so {firmware} ignores the measurements;"
-                f" set {present_name} to {choices} and reboot"
-            )
+            if values[present_name] not in allowed:
+                choices = " or ".join(f"{value:g}" for value in allowed[:4])
+                raise OperationRejected(
+                    f"{measurement}: {present_name} = {values[present_name]:g}, so {firmware} ignores the measurements;"
+                    f" set {present_name} to {choices} and reboot"
+                )
         return values

@@ -128,7 +128,8 @@ class ObstacleSectors(Snapshot):
 class ObstaclePoints(Snapshot):
     """Positions of obstacles in metres forward, right and down of the vehicle (OBSTACLE_DISTANCE_3D).
 
-    Each point is sent as one message. If there are no points, nothing is sent, and the vehicle keeps its obstacles.
+    Each point is sent as one message. If there are no points, nothing is sent, and the vehicle keeps the earlier
+    obstacles.
     """
 
     points_m: tuple[Vector, ...]
@@ -167,7 +168,10 @@ class TargetMeasurement(Snapshot):
     def from_angles(
         cls, forward_deg: float, right_deg: float, height_m: float, *, is_level: bool = False
     ) -> TargetMeasurement:
-        """Return a target ``height_m`` below a camera that sees it at these angles from straight down."""
+        """Return a target that a camera sees at these angles from straight down.
+
+        ``height_m`` is the height of the camera above the target.
+        """
         forward, right = (math.tan(math.radians(angle)) * height_m for angle in (forward_deg, right_deg))
         return cls(forward, right, height_m, is_level)
 

@@ -51,6 +51,7 @@ POSITION_MAX_AGE_S = 10.0
 # RTK float.
 QUALITIES = {4: 2, 5: 5, 6: 4}
 MAX_HEADER_LINES, MAX_CHUNK_SIZE, MAX_TABLE_SIZE = 100, 1 << 20, 4 << 20
+TABLE_END = b"ENDSOURCETABLE"
 CLOSE_TIMEOUT_S = 1.0
 
 
@@ -78,7 +79,7 @@ class Caster:
         is_scheme_valid = parts.scheme in ("ntrip", "ntrips")
         if not host or not mount or not is_mount_valid or not is_scheme_valid or port == 0:
             raise InvalidArgument(
-                "url is not allowed (it is not shown, because it may contain a password): write"
+                "url is invalid (it is not shown, because it may contain a password): write"
                 " ntrip://user:password@host:2101/MOUNT, with %40 for an @ in the password"
             )
         user, password = unquote(parts.username or ""), unquote(parts.password or "")
@@ -294,8 +295,8 @@ class NtripClient:
         finally:
             if position_task is not None:
                 position_task.cancel()
-                # Ignore the task's exception. If sending the position has failed, reading has failed too, which gives
-                # the reason.
+                # Ignore the task's exception. If the task cannot send the position, reading fails too, and `reason` is
+                # set from that failure.
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {message_count} messages")
@@ -357,10 +358,11 @@ class NtripClient:
         with anyio.move_on_after(self._timeout), suppress(OSError, ValueError, EOFError):
             async for data in response.body():
                 text += data
-                # The last row may arrive in two pieces.
-                if b"ENDSOURCETABLE" in text[-len(data) - 14 :] or len(text) > MAX_TABLE_SIZE:
+                # The last row may arrive in two pieces, so look at the end of the earlier data, too.
+                has_ended = TABLE_END in text[-len(data) - len(TABLE_END) :]
+                if has_ended or len(text) > MAX_TABLE_SIZE:
                     break
-        # In a row, column 1 is the name of the mount point, and column 11 is `nmea`.
+        # In a row, column 1 is the name of the mount point. Column 11 is 1 if the caster needs the position.
         rows = [line.split(";") for line in text.decode("latin-1").splitlines() if line.startswith("STR;")]
         needs_position: dict[str, bool] = {}
         for row in rows:

@@ -91,10 +91,10 @@ class Rtk:
             "rtk.corrections", context.session.connection.now, "corrections by rtk.send or rtk.ntrip"
         )
         self._session.register_cell(self._corrections)
-        # Numbers of messages and bytes that were sent.
-        self._messages = 0
-        self._bytes = 0
-        self._recent: deque[tuple[float, int]] = deque()  # time and size of each message in the window
+        self._message_count = 0
+        self._byte_count = 0
+        # Time and size of each message in the last BANDWIDTH_WINDOW_S.
+        self._recent: deque[tuple[float, int]] = deque()
 
     @property
     def corrections(self) -> StateCell[Corrections]:
@@ -142,8 +142,8 @@ class Rtk:
         # message, `send_rtcm` does not send it again.
         send_rtcm(self._session.connection, message, self)
         now = self._session.connection.now()
-        self._messages += 1
-        self._bytes += len(message)
+        self._message_count += 1
+        self._byte_count += len(message)
         self._recent.append((now, len(message)))
         while self._recent:
             oldest_at, _ = self._recent[0]
@@ -151,5 +151,5 @@ class Rtk:
                 break
             self._recent.popleft()
         bandwidth = sum(size for _, size in self._recent) / BANDWIDTH_WINDOW_S
-        value = Corrections(message_number(message), self._messages, self._bytes, bandwidth)
+        value = Corrections(message_number(message), self._message_count, self._byte_count, bandwidth)
         self._corrections.set(value, Source(self._session.system_id, self._session.component_id, "GPS_RTCM_DATA"))

@@ -82,8 +82,8 @@ class SensorHealth(Snapshot):
 class EstimatorHealth(Snapshot):
     """State estimator health from EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
 
-    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that are needed for
-    flight by position but are not good yet. Ratios are innovations divided by their limits: below 1 is good.
+    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that flight by
+    position needs but that are not good yet. Ratios are innovations divided by their limits: below 1 is good.
     Accuracies are one standard deviation, in metres.
     """
 
@@ -263,7 +263,7 @@ def estimator_health(message: messages.EstimatorStatus, context: Context) -> Est
 def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
     """Return the mission progress in MISSION_CURRENT."""
     state = enum_member(MissionState, message.mission_state)
-    if message.total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the number.
+    if message.total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the total.
         return MissionProgress(current=None, total=None, state=state)
     return MissionProgress(known(message.seq, unknown=U16), known(message.total, unknown=0), state)
 

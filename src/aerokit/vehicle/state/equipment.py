@@ -219,14 +219,15 @@ def cell_voltages_mv(message: messages.BatteryStatus) -> list[int]:
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
     # Cells 11 to 14 are an extension of the message, in which an absent cell may be 0 instead of U16.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
-    # PX4 reports a battery on CAN that does not measure its voltage as 0 mV.
+    # If a battery on CAN does not measure its voltage, PX4 reports 0 mV.
     return cells_mv if any(cells_mv) else []
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
     """Return all batteries reported so far, with the new values of this message's battery."""
     cells_mv = cell_voltages_mv(message)
-    # If the cells are not measured one by one, the message reports the total as one "cell" or several (see FULL_CELL).
+    # If the cells are not measured one by one, the message has the total voltage, in one or several "cells" (see
+    # FULL_CELL).
     is_only_total = len(cells_mv) == 1 or FULL_CELL in cells_mv
     battery = Battery(
         id=message.id,
@@ -244,7 +245,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
-    """Update battery 0 from SYS_STATUS and return all batteries; None if both voltage and charge are unknown."""
+    """Return all batteries, battery 0 with the values of SYS_STATUS; None if its voltage and charge are unknown."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = known(message.battery_remaining, unknown=-1)
     if voltage is None and remaining is None:
@@ -279,11 +280,11 @@ def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOu
     frame = message.received_frame
     # MAVLink 1 has no extension fields, so the message has only the first eight outputs of the port.
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT
-    outputs: tuple[int, ...] = _SERVOS(message)[:count]
-    known_outputs: tuple[int, ...] = () if context.before is None else context.before.outputs_us
     first_index = message.port * OUTPUTS_PER_PORT
-    missing = (0,) * (first_index - len(known_outputs))  # the outputs of earlier ports that were not reported yet
-    return ServoOutputs((*known_outputs[:first_index], *missing, *outputs, *known_outputs[first_index + count :]))
+    outputs: list[int] = [] if context.before is None else list(context.before.outputs_us)
+    outputs += [0] * (first_index - len(outputs))  # the outputs of earlier ports that were not reported yet
+    outputs[first_index : first_index + count] = _SERVOS(message)[:count]
+    return ServoOutputs(tuple(outputs))
 
 
 def vibration(message: messages.Vibration) -> Vibration:
@@ -349,16 +350,15 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    Yaw from the nose and yaw from north are converted to each other by ``delta_yaw`` in the message, or by the
-    vehicle's ``heading`` in degrees. If both are unknown, the result has only the yaw in the message.
+    The message has the yaw from the nose or the yaw from north. The other one is computed with the message's
+    ``delta_yaw`` or, if that is unknown, with the vehicle's ``heading`` in degrees. It is None if both are unknown.
     """
     pitch, roll, yaw = _euler(message.q)
     # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.
-    has_delta_yaw = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
-    if has_delta_yaw and message.delta_yaw:  # PX4 also sends a ``delta_yaw`` of 0 while the heading is unknown.
-        nose_heading: float | None = math.degrees(message.delta_yaw)
-    else:
-        nose_heading = heading
+    sends_delta_yaw = bool(message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME))
+    # PX4 also sends a ``delta_yaw`` of 0 while the heading is unknown.
+    knows_delta_yaw = sends_delta_yaw and math.isfinite(message.delta_yaw) and message.delta_yaw != 0
+    nose_heading = math.degrees(message.delta_yaw) if knows_delta_yaw else heading
     pitch_and_roll = (_rounded(pitch), _rounded(roll))
     if _is_from_nose(message.flags):
         yaw_from_north = None if nose_heading is None else _rounded_to_360(yaw + nose_heading)

@@ -43,7 +43,8 @@ class MessageSource(Generic[T]):
         hz: the default rate to request, in Hz.
         fallback: ignore the message if a better one has reported the state recently.
         alternative: some autopilots send this message instead of the first message of the state.
-        instance_field: the field that distinguishes several instances, all of which are kept.
+        instance_field: the field with the number of the instance, such as the battery. The state combines all
+            instances.
         watched_hz: the rate to request instead of ``hz`` while your program waits for the state or follows it.
     """
 
@@ -155,8 +156,8 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Even if the program reads no value, a frame is decoded at this interval. Otherwise later frames would replace it, and
-# after a loss of the fix, the last position would be missing.
+# Even if the program reads no value, a frame is decoded at this interval. Otherwise, a frame without a fix could
+# replace the last frame with a position before that one is decoded.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.
@@ -176,7 +177,7 @@ class StreamedMessage:
         "_apply",
         "_cells",
         "_component_id",
-        "_decode_from",
+        "_decode_due_at",
         "_instance_at",
         "_is_watched",
         "_lock",
@@ -197,22 +198,22 @@ class StreamedMessage:
         self._lock = lock
         # Offset of the instance number in `Frame.body`, None if the message has none.
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
-        # The first frame that arrives at or after this time is decoded at once.
-        self._decode_from = -math.inf
+        # From this time on, a frame is decoded when it arrives, even if no cell is read.
+        self._decode_due_at = -math.inf
         # True while one of the cells has observers.
         self._is_watched = False
         self.pending: dict[int, Frame | Message] = {}
-        """The latest frame or decoded message of each instance that was not applied to the cells yet."""
+        """The latest frame or decoded message of each instance number, until it is applied to the cells."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
-        """Keep a frame until a cell is read, or apply it now if that cannot wait.
+        """Keep a frame until a cell is read. Apply it now if a cell has observers, and once per MAX_DECODE_DELAY_S.
 
         ``message`` is the decoded frame, if it was decoded already.
         """
         if frame.component_id != self._component_id:
             return
-        if self._is_watched or frame.received_at >= self._decode_from:
-            self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
+        if self._is_watched or frame.received_at >= self._decode_due_at:
+            self._decode_due_at = frame.received_at + MAX_DECODE_DELAY_S
             # Without the lock, a thread that reads a cell could apply older frames between `catch_up` and `_apply`.
             with self._lock:
                 if self.pending:
@@ -248,4 +249,4 @@ class StreamedMessage:
     def forget(self) -> None:
         with self._lock:
             self.pending.clear()
-            self._decode_from = -math.inf
+            self._decode_due_at = -math.inf

@@ -99,7 +99,10 @@ class Attitude(Snapshot):
         z: float,
         rates_deg_s: tuple[float | None, float | None, float | None],
     ) -> Self:
-        """Return the attitude of a quaternion (w first) from earth axes (north, east, down) to body axes."""
+        """Return the attitude of a quaternion (w first), which converts vectors from body axes to north, east, down.
+
+        ``rates_deg_s`` are the turn rates about the body axes.
+        """
         roll, pitch, yaw = euler_from_quaternion(w, x, y, z)
         return cls(math.degrees(roll), math.degrees(pitch), math.degrees(yaw), *rates_deg_s)
 

@@ -20,7 +20,7 @@ CHUNK_LENGTH = 50
 CHUNK_TIMEOUT_S = 2.0
 """Seconds to wait for the next chunk of a text."""
 MAX_RECENT_TEXTS = 64
-# Maximum number of chunks of one text. A text with more chunks is invalid, and is passed on as several texts.
+# Maximum number of chunks of one text. A text with more chunks is invalid, and becomes several texts.
 MAX_CHUNKS = 20
 # Maximum number of incomplete texts of all components together. Beyond it, the oldest text is discarded.
 MAX_OPEN = 16
@@ -34,7 +34,7 @@ class StatusTextAssembler:
     """Joins the chunks of long texts (https://mavlink.io/en/messages/common.html#STATUSTEXT).
 
     A text ends with the first chunk that is not full. If a chunk is missing, or the next chunk does not arrive within
-    two seconds, the text is passed on with "…" in place of the missing part. Trailing whitespace is removed.
+    two seconds, the text has "…" in place of the missing part. Trailing whitespace is removed.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,8 @@ class StatusTextAssembler:
     def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
         """Add one message. Return the texts that are complete or truncated now.
 
-        By the standard, a text with the id 0 has a single chunk. Pass ``joins_id_0`` if it may have several.
+        By the standard, a text with the id 0 has a single chunk. ``joins_id_0`` is True if the autopilot also splits
+        texts with this id.
         """
         truncated_texts = self.expire(now)
         chunk = _bytes_of(message)
@@ -70,7 +71,7 @@ class StatusTextAssembler:
         return tuple(text for text in self._recent if text.at >= since)
 
     def about_failsafes(self) -> tuple[StatusText, ...]:
-        """Return up to 64 texts about failsafes and problems in flight, received since the last failsafe ended."""
+        """Return the last texts (64 at most) about failsafes and problems, received since the last failsafe ended."""
         return tuple(self._failsafes)
 
     def clear_failsafes(self) -> None:

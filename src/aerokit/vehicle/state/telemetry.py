@@ -65,7 +65,6 @@ class Telemetry(States):
         """True once AVAILABLE_MODES was received."""
         # Maps custom_mode to the name in AVAILABLE_MODES.
         self._mode_names: dict[int, str] = {}
-        # Additional input of the decoders, the same object for all of them.
         self._context = Context(self.autopilot, self._mode_names, lambda: self.home.is_known)
         self._cells: dict[str, StateCell[Any]] = {
             name: StateCell(name, clock, field.waits_for(self.autopilot), stamp=self._time_of_arrival)
@@ -75,12 +74,12 @@ class Telemetry(States):
         handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
         self._handlers = {MESSAGE_IDS[name]: self._receiver(name, handler) for name, handler in handlers.items()}
         self._streams = {MESSAGE_IDS[name]: self._streamed_message(name, handlers[name]) for name in LAZY}
-        # When a cell is read, it lets these streams decode the frames that they have kept.
+        # When a program reads a cell, the streams of the cell first decode the frames that they have kept.
         for cell_name, cell in self._cells.items():
             lazy_messages = (source.message for source in STATES[cell_name].sources if source.message in LAZY)
             cell._feed_from(*(self._streams[MESSAGE_IDS[name]] for name in lazy_messages))
 
-    # ------------------------------------------------------------------------------- feeding
+    # ----------------------------------------------------------------------------- receiving
 
     @property
     def handles(self) -> Mapping[int, Callable[[Any], None]]:
@@ -232,18 +231,15 @@ class Telemetry(States):
         """Return the function that updates the cell of a state from one type of message."""
         cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
-        # A frame that was kept undecoded must not replace a newer value from a message of another type.
+        # A lazy message is decoded late. It must not replace a newer value from a message of another type.
         may_be_older = message_source.message in LAZY and len(field.sources) > 1
 
         def update(message: Any, source: Source) -> None:
             value = decode(message)
             if value is None:  # The message does not have the value, so the cell keeps its previous value.
                 return
-            if may_be_older:
-                latest = cell.source
-                is_other_type = latest is not None and latest.message != source.message
-                if is_other_type and self._time_of_arrival() < cell._updated_at:
-                    return
+            if may_be_older and _is_from_other_message(cell, source) and self._time_of_arrival() < cell._updated_at:
+                return
             cell.set(value, source)
 
         def update_with_context(message: Any, source: Source) -> None:
@@ -278,9 +274,7 @@ class Telemetry(States):
 
     def _has_recent_better_value(self, cell: StateCell[Any], source: Source) -> bool:
         """Return True if another message than the fallback ``source`` recently reported the value."""
-        latest = cell.source
-        is_other_message = latest is not None and latest.message != source.message
-        return is_other_message and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
+        return _is_from_other_message(cell, source) and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
 
     # --------------------------------------------------------- messages with special handling
 
@@ -317,6 +311,11 @@ class Telemetry(States):
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:
             self.status_text.set(text, source)
+
+
+def _is_from_other_message(cell: StateCell[Any], source: Source) -> bool:
+    """Return True if the value of the cell is from another message type than ``source``."""
+    return cell.source is not None and cell.source.message != source.message
 
 
 def is_reported_on_ground(vehicle: States, *, max_age_s: float = LANDED_STATE_MAX_AGE_S) -> bool:
