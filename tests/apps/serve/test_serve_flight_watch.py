@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any
@@ -44,7 +45,8 @@ async def test_fall_while_hovering_is_reported_as_crash() -> None:
         assert state_of(stage)["crash"] is None
         await anyio.sleep(5)
         crash = state_of(stage)["crash"]
-        assert crash["text"] == "the vehicle hit the ground at 11.4 m/s"
+        # The last velocity report before the impact is up to 0.1 s old.
+        assert re.fullmatch(r"the vehicle hit the ground at 1[01]\.\d m/s", crash["text"])
         age_s = stage.flight.vehicle.connection.unix_time() - crash["at_unix_s"]
         assert age_s == pytest.approx(4.2, abs=0.3)
         assert state_of(stage)["states"]["armed"]["value"] is True
