@@ -35,7 +35,7 @@ MAX_ATTEMPTS = 4
 _PARAM1_IS_0, _PARAM1_IS_1, _PARAM1_IS_2, _PARAM4_IS_1 = (0, 0.0), (0, 1.0), (0, 2.0), (3, 1.0)
 
 # Commands whose repetition has a further effect. Maps MAV_CMD to (effect, condition). If the condition is None, every
-# repetition has the effect. docs/reliability.md has the same table.
+# repetition has the effect.
 UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
     MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _PARAM1_IS_1),
     MavCmd.CONDITION_YAW: ("turns by the same angle again", _PARAM4_IS_1),
