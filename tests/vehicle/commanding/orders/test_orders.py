@@ -22,7 +22,6 @@ from order_judge import faults
 from order_table import ARM, REPOSITION, ROWS, SET_MODE
 
 from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
-from aerokit.mavlink.enums import MavCmd
 
 SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
 BY_NAME = {row.name: row for row in ROWS}
