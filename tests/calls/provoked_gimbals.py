@@ -179,6 +179,9 @@ def _table() -> Table:
         ),
         ("Gimbal.stop_looking", "CommandRejected"): P(_call("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)),
         ("Gimbal.stop_looking", "CommandTimeout"): P(_call("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)),
+        ("Gimbal.stop_looking", "OperationRejected"): later(
+            _call("stop_looking"), _another_order, 0.5, grounded, before=ignored(Cmd.DO_SET_ROI_NONE)
+        ),
         ("Gimbal.stop_looking", "GimbalTaken"): _taken(_call("stop_looking")),
         ("Gimbal.information", "CommandRejected"): P(
             _call("information"), before=refused(Cmd.REQUEST_MESSAGE), alone=True

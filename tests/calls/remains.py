@@ -50,7 +50,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("end of the connection", connection._end_signal._callbacks)
     yield from _times("deadline", connection.deadlines._deadlines)
     for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality):
-        yield from _times(f"waiter on {cell.name}", cell._sinks)
+        yield from _times(f"waiter on {cell.name}", cell._listeners)
     for stream in streams:
         yield from _times(f"wish for {stream.message_type.NAME}", stream.requests)
     yield from _times(

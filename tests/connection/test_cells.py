@@ -200,7 +200,7 @@ async def test_cancelled_wait_leaves_nothing_behind() -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-    assert not cell._sinks
+    assert not cell._listeners
     handles = [handle for handle in _timers() if not handle.cancelled()]
     assert handles == []
 
@@ -256,7 +256,7 @@ async def test_loop_left_early_leaves_nothing_behind() -> None:
     async for value in cell.changes():
         assert value == 1
         break
-    assert not cell._sinks
+    assert not cell._listeners
 
 
 async def test_same_value_after_forget_is_a_change() -> None:

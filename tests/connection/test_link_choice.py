@@ -46,7 +46,7 @@ def test_unproven_link_is_never_used(
 
     Both are simulated on one machine, so they report the same hardware id.
     """
-    choice, now, begin = LinkChoice(needs_proof=True), 1.0, -50.0
+    choice, now, begin = LinkChoice(has_autopilot=True), 1.0, -50.0
     choice.record_heartbeat(0, now, is_costly=False)
     assert choice.choose(now) == "first heard"
     received = 0
@@ -86,7 +86,9 @@ def test_unproven_link_is_never_used(
                 assert reason in ("better", "cheaper")
         elif choice.used is before and before is not None and not before.is_alive(now):
             others = [
-                candidate for candidate in choice.candidates.values() if candidate is not before and candidate.is_proven
+                candidate
+                for candidate in choice.candidates.values()
+                if candidate is not before and candidate.is_same_vehicle
             ]
             assert not any(other.is_alive(now) for other in others), "a live link was not selected"
 
@@ -105,7 +107,7 @@ def test_clock_continues_at_any_speed(speed: float, begin: float, round_trips: l
 
 
 def test_reboot_resets_proof_until_clock_matches_again() -> None:
-    choice = LinkChoice(needs_proof=True)
+    choice = LinkChoice(has_autopilot=True)
     for link in (0, 1):
         choice.record_heartbeat(link, 0.0, is_costly=False)
     choice.choose(0.0)
@@ -113,13 +115,13 @@ def test_reboot_resets_proof_until_clock_matches_again() -> None:
         for link in (0, 1):
             choice.record_answer(link, step, step + 70.0, 0.01, step)
     second = choice.candidates[1]
-    proofs = [second.is_proven]
+    proofs = [second.is_same_vehicle]
     choice.record_answer(0, 5.0, 1.0, 0.01, 5.0)
-    assert [*proofs, second.is_proven] == [True, False]
+    assert [*proofs, second.is_same_vehicle] == [True, None]
     choice.record_answer(0, 6.0, 2.0, 0.01, 6.0)
     for step in range(MIN_CLOCK_MATCHES):
         choice.record_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
-    assert choice.candidates[1].is_proven
+    assert choice.candidates[1].is_same_vehicle
 
 
 def test_paused_clock_continues_at_the_same_speed() -> None:
@@ -145,7 +147,7 @@ def test_changed_clock_speed_is_measured_again(before: float, after: float) -> N
 def test_hardware_alone_proves_only_previously_proven_link() -> None:
     """The link in use fails during the reboot, and a pause makes the clock of the other link useless."""
     for was_proven in (True, False):
-        choice = LinkChoice(needs_proof=True)
+        choice = LinkChoice(has_autopilot=True)
         for link in (0, 1):
             choice.record_heartbeat(link, 0.0, is_costly=False)
         choice.choose(0.0)
@@ -155,18 +157,18 @@ def test_hardware_alone_proves_only_previously_proven_link() -> None:
         choice.record_hardware(0, HardwareId(b"A" * 18, 0))
         choice.record_answer(0, 10.0, 1.0, 0.01, 10.0)
         second = choice.candidates[1]
-        assert (second.is_proven, second.was_proven) == (False, was_proven)
+        assert (second.is_same_vehicle, second.was_same_vehicle) == (None, was_proven)
         for step in range(11, 20):
             choice.record_hardware(1, HardwareId(b"A" * 18, 0))
             choice.record_answer(1, step, step - 11.0, 0.01, step)
-        assert second.is_proven is was_proven
+        assert bool(second.is_same_vehicle) is was_proven
         choice.record_hardware(1, HardwareId(b"B" * 18, 0))
         assert not choice.may_be_used(second)
 
 
 def test_other_hardware_after_reboot_outweighs_the_clock() -> None:
     """Two vehicles are switched off and on together; the link in use fails before ours has reported its id again."""
-    choice = LinkChoice(needs_proof=True)
+    choice = LinkChoice(has_autopilot=True)
     for link in (0, 1):
         choice.record_heartbeat(link, 0.0, is_costly=False)
     choice.choose(0.0)
@@ -181,7 +183,7 @@ def test_other_hardware_after_reboot_outweighs_the_clock() -> None:
 
 
 def test_silence_counts_from_the_last_frame() -> None:
-    choice = LinkChoice(needs_proof=False)
+    choice = LinkChoice(has_autopilot=False)
     first = choice.record_heartbeat(0, 0.0, is_costly=False)
     second = choice.record_heartbeat(1, 0.0, is_costly=False)
     choice.choose(0.0)
@@ -208,27 +210,27 @@ def test_one_copy_of_each_frame_is_accepted(rest: list[tuple[int, float]], seque
         if link in observed:
             continue  # the same link again: another frame
         observed.add(link)
-        if not copies.is_copy(frame_of(sequence, 10.0 + delay), link):
+        if not copies.record(frame_of(sequence, 10.0 + delay), link):
             taken += 1
-            copies.accept()
+            copies.current.is_delivered = True
         else:
-            assert copies.was_accepted
+            assert copies.current.is_delivered
     assert taken == (1 if observed else 0)
 
 
 def test_equal_bytes_same_link_or_later_are_not_copies() -> None:
     copies = Copies()
-    assert not copies.is_copy(frame_of(7, 0.0), 0)
-    assert not copies.is_copy(frame_of(7, 0.1), 0)
-    assert copies.is_copy(frame_of(7, 0.2), 1)
-    assert not copies.is_copy(frame_of(7, 4.0), 1)
+    assert not copies.record(frame_of(7, 0.0), 0)
+    assert not copies.record(frame_of(7, 0.1), 0)
+    assert copies.record(frame_of(7, 0.2), 1)
+    assert not copies.record(frame_of(7, 4.0), 1)
     for number in range(130):
-        assert not copies.is_copy(frame_of((8 + number) % 256, 4.1, number + 1), 0)
-    assert not copies.is_copy(frame_of(7, 4.2), 0), "its sequence numbers have wrapped around"
+        assert not copies.record(frame_of((8 + number) % 256, 4.1, number + 1), 0)
+    assert not copies.record(frame_of(7, 4.2), 0), "its sequence numbers have wrapped around"
 
 
 def test_copies_are_bounded() -> None:
     copies = Copies()
     for number in range(20_000):
-        copies.is_copy(frame_of(number % 256, 0.0, number), 0)
+        copies.record(frame_of(number % 256, 0.0, number), 0)
     assert len(copies._seen) <= 4096

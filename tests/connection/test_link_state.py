@@ -53,11 +53,11 @@ def test_silence_starts_after_three_and_a_half_seconds() -> None:
     bus, now = Bus(), 0.0
     observed: list[events.LinkStateChanged] = []
     bus.attach_event(events.LinkStateChanged, observed.append)
-    watch = LinkStateTracker(StateCell("link_state", lambda: now, "frame"), bus, system_id=7)
-    states = []
+    cell: StateCell[events.LinkState] = StateCell("link_state", lambda: now, "frame")
+    tracker, states = LinkStateTracker(cell, bus, system_id=7), []
     for now, frames in ((0.0, 0), (1.0, 0), (9.0, 1), (12.5, 1), (12.6, 1), (99.0, 1), (99.1, 2), (102.6, 2)):
-        watch.update(now, frames)
-        states.append(watch.state)
+        tracker.update(now, frames)
+        states.append(cell.latest)
     assert states == [None, None, CONNECTED, CONNECTED, SILENT, SILENT, CONNECTED, CONNECTED]
     assert observed == [
         events.LinkStateChanged(12.6, 7, CONNECTED, SILENT),

@@ -15,7 +15,7 @@ import aerokit
 from aerokit import Signing, SigningKey, events, open_connection
 from aerokit.connection.connection import Connection
 from aerokit.connection.frame_receiver import MAX_UNVERIFIED_PEERS
-from aerokit.connection.routes import MAX_CLAIMS, Routes
+from aerokit.connection.routes import MAX_OTHER_PEERS, Routes
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, RadioStatus, SystemTime
@@ -213,14 +213,14 @@ async def test_heartbeats_of_many_senders_fill_no_table(link: PeerKeepingLink) -
         assert len(connection.heartbeats) < 50
 
 
-async def test_claims_are_bounded(link: PeerKeepingLink) -> None:
+async def test_other_peers_are_bounded(link: PeerKeepingLink) -> None:
     async with flown(link) as (vehicle, _):
-        for port in range(MAX_CLAIMS + 100):
+        for port in range(MAX_OTHER_PEERS + 100):
             for component_id in (1, 2, 3):
                 link.receive(f"{port % 200}@stranger", (1, component_id), COPTER)
         routes = vehicle.connection._routes
         assert isinstance(routes, Routes)
-        assert len(routes._claims) <= MAX_CLAIMS
+        assert len(routes._other_peers) <= MAX_OTHER_PEERS
 
 
 # ------------------------------------------------------------------------- taking a route

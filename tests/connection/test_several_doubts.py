@@ -105,7 +105,7 @@ async def test_broadcast_command_reaches_each_system_once() -> None:
 
 def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
     """Two vehicles were switched on ten seconds apart; ours is switched off."""
-    choice, now = LinkChoice(needs_proof=True), 0.0
+    choice, now = LinkChoice(has_autopilot=True), 0.0
     while now < 30.0:
         for link in (0, 1):
             choice.record_heartbeat(link, now, is_costly=False)
@@ -113,7 +113,7 @@ def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
         choice.record_answer(0, now, 100.0 + now, 0.02, now)
         choice.record_answer(1, now, 90.0 + now, 0.02, now)
         now += 0.5
-    assert choice.candidates[1].is_doubted
+    assert choice.candidates[1].is_same_vehicle is False
     while now < 3000.0:
         choice.record_heartbeat(1, now, is_costly=False)
         choice.record_answer(1, now, 90.0 + now, 0.02, now)
@@ -123,7 +123,7 @@ def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
 
 
 def test_late_link_is_proven_by_its_clock() -> None:
-    choice, now = LinkChoice(needs_proof=True), 0.0
+    choice, now = LinkChoice(has_autopilot=True), 0.0
     while now < 30.0:
         choice.record_heartbeat(0, now, is_costly=False)
         choice.choose(now)
@@ -210,7 +210,7 @@ async def test_copies_prove_only_links_with_frames_of_link_in_use(order: tuple[i
             for index in order:
                 radios.far[index].write(data)
                 await anyio.sleep(0.01)
-            proven.append([link for link in (1, 2) if candidates_of(connection)[link].is_proven])
+            proven.append([link for link in (1, 2) if candidates_of(connection)[link].is_same_vehicle])
         assert proven == [[]] * (MIN_COPIES - 1) + [[1, 2] if 0 in order else []]
 
 
@@ -246,7 +246,7 @@ async def test_copies_over_link_to_other_hardware_prove_nothing() -> None:
             for far in radios.far:
                 far.write(data)
             await anyio.sleep(0.1)
-        assert not candidates_of(connection)[1].is_proven
+        assert not candidates_of(connection)[1].is_same_vehicle
 
 
 @pytest.mark.parametrize("is_first_used", [True, False])
@@ -260,12 +260,12 @@ async def test_copies_of_second_sender_prove_no_link(is_first_used: bool, is_sec
         ours, theirs = FrameEncoder(1, 1), FrameEncoder(1, 1)
         peers = {0: ("127.0.0.1", 9), 1: ("127.0.0.2", 9)}
         for index, encoder in ((0, ours), (1, theirs)):
-            link._on_bytes(index, encoder.encode(AUTOPILOT), peers[index])
+            link._members[index].bytes_received(encoder.encode(AUTOPILOT), peers[index])
         for step in range(MIN_COPIES):
             data = theirs.encode(m.Attitude(10_000 + step, *(0.0,) * 6))
             for index in (0, 1) if is_first_used else (1, 0):
-                link._on_bytes(index, data, peers[1 if is_second_sender else index])
-        assert candidates_of(connection)[1].is_proven is not is_second_sender
+                link._members[index].bytes_received(data, peers[1 if is_second_sender else index])
+        assert bool(candidates_of(connection)[1].is_same_vehicle) is not is_second_sender
 
 
 async def test_hardware_id_relayed_by_second_sender_proves_no_link() -> None:
@@ -276,12 +276,12 @@ async def test_hardware_id_relayed_by_second_sender_proves_no_link() -> None:
         ours, theirs = FrameEncoder(1, 1), FrameEncoder(1, 1)
         peers = {0: ("127.0.0.1", 9), 1: ("127.0.0.2", 9)}
         for index, encoder, uid in ((0, ours, b"A" * 18), (1, theirs, b"B" * 18)):
-            link._on_bytes(index, encoder.encode(AUTOPILOT), peers[index])
-            link._on_bytes(index, encoder.encode(version(uid)), peers[index])
+            link._members[index].bytes_received(encoder.encode(AUTOPILOT), peers[index])
+            link._members[index].bytes_received(encoder.encode(version(uid)), peers[index])
         assert candidates_of(connection)[1].is_other_hardware
         data = ours.encode(version(b"A" * 18))
         for index in (0, 1):
-            link._on_bytes(index, data, peers[0])
+            link._members[index].bytes_received(data, peers[0])
         assert candidates_of(connection)[1].is_other_hardware
 
 
@@ -303,7 +303,7 @@ async def test_forged_copies_prove_no_link(is_signed: bool) -> None:
             for far in radios.far:
                 far.write(data)
             await anyio.sleep(0.1)
-        assert candidates_of(connection)[1].is_proven is is_signed
+        assert bool(candidates_of(connection)[1].is_same_vehicle) is is_signed
 
 
 async def test_link_in_use_elsewhere_is_left_unchanged() -> None:
@@ -434,7 +434,7 @@ async def test_switch_to_better_link_delays_no_command() -> None:
 
 
 def test_continuous_commands_delay_switch_for_limited_time() -> None:
-    choice, now, changed_at = LinkChoice(needs_proof=False), 0.0, None
+    choice, now, changed_at = LinkChoice(has_autopilot=False), 0.0, None
     choice.record_heartbeat(0, now, is_costly=False)
     choice.choose(now)
     while now < 40.0 and changed_at is None:
@@ -470,7 +470,7 @@ async def switched_to_better_link(connection: Connection, ports: Ports, radios: 
         assert connection._multilink is not None
         choice = connection._multilink._choices.get(1)
         if choice is not None and 1 in choice.candidates:
-            choice.candidates[1].is_proven = True
+            choice.candidates[1].is_same_vehicle = True
             choice.candidates[0].record_round_trip(1.0, connection.now())
             choice.candidates[1].record_round_trip(0.01, connection.now())
         if choice is not None and choice.used is choice.candidates.get(1):
@@ -520,7 +520,7 @@ async def test_peer_is_named_as_by_its_member_link() -> None:
                 said.append(f"127.0.0.1:{here.getsockname()[1]}")
                 encoder = FrameEncoder(1, 1)
                 for _ in range(4):
-                    link._on_bytes(1, encoder.encode(AUTOPILOT), here.getsockname())
+                    link._members[1].bytes_received(encoder.encode(AUTOPILOT), here.getsockname())
                     await anyio.sleep(0.1)
             if round_ == 0:
                 await anyio.sleep(4)

@@ -72,7 +72,7 @@ async def test_vehicle_with_other_hardware_id_is_reported_and_refused(
                     await flying.arm()
                 assert not twins.theirs.is_armed
                 assert [index for index, _ in twins.reported.of(m.CommandLong) if index == 1] == []
-                assert choice_of(connection).candidates[1].is_doubted
+                assert choice_of(connection).candidates[1].is_same_vehicle is False
     warnings = [record.getMessage() for record in caplog.records if "hardware id" in record.getMessage()]
     assert len(warnings) == 1
     assert "another vehicle with system id 1 was received over" in warnings[0]
@@ -88,7 +88,7 @@ async def test_clock_decides_without_two_hardware_ids(ours: bytes, theirs: bytes
         async with aerokit.connect(connection) as flying:
             await flying.wait_ready()
             await anyio.sleep(4)
-            assert choice_of(connection).candidates[1].is_proven
+            assert choice_of(connection).candidates[1].is_same_vehicle
             assert doubts.all == []
 
 
@@ -98,7 +98,7 @@ async def test_both_links_are_probed_without_vehicle_object() -> None:
         await anyio.sleep(5)
         asked = [index for index, message in twins.reported.of(m.CommandLong) if getattr(message, "command", 0) == 512]
         assert sorted(asked) == [0, 1]
-        assert choice_of(connection).candidates[1].is_doubted
+        assert choice_of(connection).candidates[1].is_same_vehicle is False
 
 
 async def test_second_radio_is_asked_once_for_hardware() -> None:
@@ -109,7 +109,7 @@ async def test_second_radio_is_asked_once_for_hardware() -> None:
         await anyio.sleep(5)
         asked = [message for index, message in received.of(m.CommandLong) if index == 1]
         assert [(getattr(request, "command", 0), getattr(request, "param1", 0)) for request in asked] == [(512, 148)]
-        assert choice_of(connection).candidates[1].is_proven
+        assert choice_of(connection).candidates[1].is_same_vehicle
 
 
 async def test_lost_hardware_request_is_repeated() -> None:
@@ -124,15 +124,15 @@ async def test_lost_hardware_request_is_repeated() -> None:
 
     twins.radios.links[1].link.write = lose_two  # type: ignore[method-assign]
     async with twins.connected() as connection:
-        proven: list[bool] = []
+        proven: list[bool | None] = []
         async with aerokit.connect(connection) as flying:
             await flying.wait_ready()
             for _ in range(60):
                 await anyio.sleep(0.1)
-                proven.append(choice_of(connection).candidates[1].is_proven)
+                proven.append(choice_of(connection).candidates[1].is_same_vehicle)
         assert lost == [2]
         assert not any(proven)
-        assert choice_of(connection).candidates[1].is_doubted
+        assert choice_of(connection).candidates[1].is_same_vehicle is False
 
 
 async def test_wrongly_used_vehicle_is_ignored_once_known(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ class Answers:
     """Two links on which the same time is received."""
 
     def __init__(self) -> None:
-        self.choice, self.now = LinkChoice(needs_proof=True), 0.0
+        self.choice, self.now = LinkChoice(has_autopilot=True), 0.0
         for link in (0, 1):
             self.choice.record_heartbeat(link, 0.0, is_costly=False)
         self.choice.choose(0.0)
@@ -185,7 +185,8 @@ class Answers:
             self.now += 0.5
             for link in links or (0, 1):
                 self.choice.record_heartbeat(link, self.now, is_costly=False)
-                self.choice.should_request_hardware(self.choice.candidates[link], is_attached=True)
+                if self.choice.should_request_hardware(candidate := self.choice.candidates[link], is_attached=True):
+                    candidate.count_hardware_request()
                 self.choice.record_answer(link, self.now, self.now + ahead_s, 0.01, self.now)
             self.choice.choose(self.now)
 
@@ -194,7 +195,7 @@ def test_vehicle_without_hardware_id_is_proven_by_clock() -> None:
     answers = Answers()
     answers.choice.record_hardware(0, OURS)
     steps = 0
-    while not answers.second.is_proven:
+    while not answers.second.is_same_vehicle:
         answers.answer_probes(1)
         steps += 1
     assert MIN_CLOCK_MATCHES < steps <= 1 + MIN_CLOCK_MATCHES + MAX_ANSWERS_WITHOUT_HARDWARE
@@ -210,8 +211,8 @@ def test_late_other_hardware_id_disables_the_link() -> None:
         answers.second.record_copy(answers.now)
     answers.answer_probes(10)
     assert not answers.choice.may_be_used(answers.second)
-    assert answers.second.is_doubted
-    assert not answers.second.is_proven
+    assert answers.second.is_same_vehicle is False
+    assert not answers.second.is_same_vehicle
 
 
 def test_used_link_with_other_hardware_gets_nothing() -> None:
@@ -227,7 +228,7 @@ def test_used_link_with_other_hardware_gets_nothing() -> None:
     answers.choice.record_heartbeat(0, answers.now, is_costly=False)
     assert answers.choice.choose(answers.now) == "another vehicle"
     assert answers.choice.used is answers.choice.candidates[0]
-    assert not answers.second.is_proven
+    assert not answers.second.is_same_vehicle
 
 
 def test_hardware_may_change_after_reboot() -> None:
@@ -240,7 +241,7 @@ def test_hardware_may_change_after_reboot() -> None:
         answers.choice.record_hardware(link, THEIRS)
     answers.answer_probes(10, ahead_s=0.0)
     assert answers.choice.may_be_used(answers.second)
-    assert not answers.second.is_doubted
+    assert answers.second.is_same_vehicle is not False
 
 
 def test_hardware_ids_are_compared_by_common_field() -> None:

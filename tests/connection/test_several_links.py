@@ -45,7 +45,7 @@ async def proven(connection: aerokit.Connection, link: int) -> None:
     """Wait until a link may be used, too."""
     choice = connection._routes._choices[1]  # type: ignore[union-attr]
     with anyio.fail_after(20):
-        while link not in choice.candidates or not choice.candidates[link].is_proven:  # noqa: ASYNC110
+        while link not in choice.candidates or not choice.candidates[link].is_same_vehicle:  # noqa: ASYNC110
             await anyio.sleep(0.1)
 
 

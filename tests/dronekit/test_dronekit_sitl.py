@@ -104,9 +104,8 @@ def test_sim_option_serves_vehicle(
     program.write_text(ADDRESSES_GIVEN)
     instance = free_instance()
     port = 5760 + 10 * instance
-    monkeypatch.setattr(
-        "aerokit.dronekit.sitl.USUAL_ADDRESSES", (f"tcpin:127.0.0.1:{port}", f"udpout:127.0.0.1:{port}")
-    )
+    monkeypatch.setattr("aerokit.dronekit.sitl.TCP_ADDRESS", f"tcpin:127.0.0.1:{port}")
+    monkeypatch.setattr("aerokit.dronekit.sitl.UDP_ADDRESS", f"udpout:127.0.0.1:{port}")
     monkeypatch.setattr(sys, "path", ["", *sys.path])
     monkeypatch.setattr(sys, "argv", [""])
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
@@ -127,8 +126,8 @@ def simulated_vehicle_threads() -> list[threading.Thread]:
 
 
 def test_sim_option_missing_module_stops_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
-    addresses = ("tcpin:127.0.0.1:0", f"udpout:127.0.0.1:{5760 + 10 * free_instance()}")
-    monkeypatch.setattr("aerokit.dronekit.sitl.USUAL_ADDRESSES", addresses)
+    monkeypatch.setattr("aerokit.dronekit.sitl.TCP_ADDRESS", "tcpin:127.0.0.1:0")
+    monkeypatch.setattr("aerokit.dronekit.sitl.UDP_ADDRESS", f"udpout:127.0.0.1:{5760 + 10 * free_instance()}")
     monkeypatch.setattr(sys, "path", ["", *sys.path])
     try:
         assert runner.main(["--sim", "-m", "no_such_module"]) == 1

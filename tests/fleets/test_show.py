@@ -215,7 +215,7 @@ async def test_invalid_position_is_not_recorded() -> None:
     """Autopilots that have lost their position report 0°N 0°E."""
     async with open_stage(1) as stage:
         vehicle, wire = stage.fleet.vehicles["north/1"], stage.wires["north"]
-        with TrackRecorder(vehicle, ClockOffset(0.0, 0.0, 1), LocalOrigin(ORIGIN), 0.0, HOME[2]) as recorder:
+        with TrackRecorder(vehicle, ClockOffset(0.0, 0.0, 1), LocalOrigin(ORIGIN, HOME[2]), 0.0) as recorder:
             for latitude_deg in (0.0, HOME[0]):
                 position = m.GlobalPositionInt(
                     0, round(latitude_deg * 1e7), round(latitude_deg * 1e7), 0, 0, 0, 0, 0, 0

@@ -405,9 +405,11 @@ def _winch_errors(name: str) -> Table:
         (key, "CommandRejected"): P(do, before=_component(0, refuse=C.DO_WINCH)),
         (key, "CommandTimeout"): P(do, before=_component(0, ignore=C.DO_WINCH)),
     }
-    if name not in ("deliver", "hold"):
+    is_awaited = name not in ("deliver", "hold")
+    trouble = _stuck if is_awaited else _component(0, ignore=C.DO_WINCH)
+    rows[key, "OperationRejected"] = P(_superseded(do, lambda v: v.winch(component_id=169).hold()), before=trouble)
+    if is_awaited:
         rows |= {
-            (key, "OperationRejected"): P(_superseded(do, lambda v: v.winch(component_id=169).hold()), before=_stuck),
             (key, "HeartbeatTimeout"): P(do, before=_fitted(_stuck, _silent_soon), alone=True),
             (key, "OperationTimeout"): P(do, before=_stuck),
         }
@@ -445,6 +447,10 @@ DEVICE_ERRORS: Table = {
     ("Actuators.release_parachute", "CommandTimeout"): P(_do(_release), before=_fitted(ignored(C.DO_PARACHUTE))),
     ("Actuators.release_parachute", "OperationTimeout"): P(_do(_release), before=_fitted(accepted(C.DO_PARACHUTE))),
     ("Winch.pay_out", "OperationRejected"): P(_superseded(_do(_pay_out), lambda v: v.winch().relax()), before=fit),
+    ("Winch.relax", "OperationRejected"): P(
+        _superseded(_do(lambda v: v.winch().relax()), lambda v: v.winch().relax()),
+        before=_fitted(ignored(C.DO_WINCH)),
+    ),
     ("Winch.pay_out", "HeartbeatTimeout"): P(_do(_pay_out), before=_fitted(_silent_soon), alone=True),
     ("Winch.pay_out", "OperationTimeout"): P(_do(lambda v: v.winch().pay_out(50, timeout=2)), before=fit),
     ("Winch.set_rate", "OperationRejected"): P(

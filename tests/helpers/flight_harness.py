@@ -210,7 +210,7 @@ def attached_sinks(connection: Connection) -> int:
 
 def waiting_on_cells(vehicle: aerokit.Vehicle) -> int:
     """Count the waiters and observers of a vehicle's state cells."""
-    return sum(len(cell._sinks) for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality))
+    return sum(len(cell._listeners) for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality))
 
 
 @dataclass

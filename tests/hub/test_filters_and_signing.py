@@ -7,7 +7,7 @@ import pytest
 from aerokit import Signing, SigningKey
 from aerokit.errors import InvalidArgument
 from aerokit.hub.message_rules import Filters
-from aerokit.hub.port import SigningGateway
+from aerokit.hub.port import FrameSigner
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -49,9 +49,9 @@ def test_pattern_without_match_is_refused(fields: dict[str, object], text: str) 
         Filters(STANDARD, **fields)  # type: ignore[arg-type]
 
 
-def border() -> tuple[SigningGateway, list[str]]:
+def border() -> tuple[FrameSigner, list[str]]:
     refused: list[str] = []
-    return SigningGateway(Signing(KEY), STANDARD.extras, lambda frame, why: refused.append(why)), refused
+    return FrameSigner(Signing(KEY), STANDARD.extras, lambda frame, why: refused.append(why)), refused
 
 
 MESSAGES = [Heartbeat(2, 3, 81, 0, 3), ParamRequestList(1, 0), CommandAck(400, 0, 0, 0, 255, 190)]
@@ -95,7 +95,7 @@ def test_unsigned_frame_is_refused() -> None:
 
 def test_allow_unsigned_admits_a_radio() -> None:
     signing = Signing(KEY, allow_unsigned=lambda frame: frame.system_id == 7)
-    own = SigningGateway(signing, STANDARD.extras, lambda frame, why: None)
+    own = FrameSigner(signing, STANDARD.extras, lambda frame, why: None)
     frame = Frame.parse(FrameEncoder(7, 9).encode(MESSAGES[0]))
     assert own.verify(frame, NOW) is frame
     assert own.verify(Frame.parse(FrameEncoder(8, 9).encode(MESSAGES[0])), NOW) is None
@@ -104,7 +104,7 @@ def test_allow_unsigned_admits_a_radio() -> None:
 def test_allow_unsigned_exception_refuses() -> None:
     refused: list[str] = []
     signing = Signing(KEY, allow_unsigned=lambda frame: 1 / 0 > 1)
-    own = SigningGateway(signing, STANDARD.extras, lambda frame, why: refused.append(why))
+    own = FrameSigner(signing, STANDARD.extras, lambda frame, why: refused.append(why))
     assert own.verify(Frame.parse(FrameEncoder(7, 9).encode(MESSAGES[0])), NOW) is None
     assert "ZeroDivisionError" in refused[0]
 

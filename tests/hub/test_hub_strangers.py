@@ -106,7 +106,7 @@ async def test_disconnected_clients_leave_nothing() -> None:
             await writer.drain()
             writer.close()
         await until(lambda: sum(event.kind == "client_left" for event in events) == 200)
-        assert (len(router._nodes), len(router._senders)) == (2, 2)
+        assert (len(router._ingresses), len(router._senders)) == (2, 2)
         assert len(list(hub._attachments["stations"]._peers)) == 1
         station.send(ORDER)
         await until(lambda: "COMMAND_LONG" in copter.received)

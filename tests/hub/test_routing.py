@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from aerokit.connection.routes import MAX_ROUTES, ROUTE_TIMEOUT_S
 from aerokit.hub.message_rules import TargetFields
-from aerokit.hub.routing import MAX_PLANS, Router, RouterPort
+from aerokit.hub.routing import MAX_PLANS, Ingress, Router
 from aerokit.hub.senders import DUPLICATE_WINDOW_S, MAX_RECENT_FRAMES
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -45,7 +45,7 @@ class Stage:
     def __init__(self) -> None:
         self.wishes: dict[tuple[str, int], float | None] = {}
         self.router: Router[str] = Router(TARGETS, lambda port, number: self.wishes.get((port, number), 0.0))
-        self.nodes: dict[str, RouterPort[str]] = {name: self.router.add(name) for name in "abcd"}
+        self.nodes: dict[str, Ingress[str]] = {name: self.router.add(name) for name in "abcd"}
         self.encoders: dict[tuple[str, int, int], FrameEncoder] = {}
         self.now = 100.0
 
@@ -272,7 +272,7 @@ class Network:
         self.count = self.hops = 0
         self.got: dict[int, Counter[bytes]] = defaultdict(Counter)
         self.routers: list[Router[tuple[int, int]]] = [Router(TARGETS, lambda port, number: 0.0) for _ in range(hubs)]
-        self.nodes: list[dict[tuple[int, int], RouterPort[tuple[int, int]]]] = [{} for _ in range(hubs)]
+        self.nodes: list[dict[tuple[int, int], Ingress[tuple[int, int]]]] = [{} for _ in range(hubs)]
         self.far: dict[tuple[int, tuple[int, int]], tuple[int, tuple[int, int]]] = {}
         for hub in range(hubs):
             self._port(hub, (-1, 0))

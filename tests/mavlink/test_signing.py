@@ -159,6 +159,15 @@ def test_exhausted_timestamps_raise() -> None:
         signed(signing)
 
 
+def test_frame_that_cannot_be_signed_is_not_counted() -> None:
+    encoder = FrameEncoder(1, 1)
+    encoder.signing = Signing(KEY, timestamp=(1 << 48) - 1)
+    encoder.encode(HEARTBEAT)
+    with pytest.raises(InvalidArgument, match="exhausted"):
+        encoder.encode(HEARTBEAT)
+    assert encoder.sequence == 1
+
+
 # -------------------------------------------------------------------------------- rejected frames
 
 

@@ -13,6 +13,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavType
 from aerokit.mavlink.message import Message
 from aerokit.onboard import OnboardComponent
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.transport import memory_link_pair
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -22,7 +23,7 @@ class Station:
     """A ground station that sends raw messages to a component and collects its answers."""
 
     def __init__(self, connection: Connection, target: tuple[int, int]) -> None:
-        self.connection, self.target = connection, target
+        self.connection, self.target = connection, ComponentIds(*target)
         self.received: list[Message] = []
 
     @contextmanager

@@ -14,7 +14,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import ParamSet, ParamValue
 from aerokit.parameters import Parameter, ParameterType, checked_value
-from aerokit.parameters.encoding import from_wire, parameter_of, set_message, to_wire, value_message, value_of
+from aerokit.parameters.encoding import parameter_of, set_message, value_message, value_of
 
 SMALL = [ParameterType.UINT8, ParameterType.INT8, ParameterType.UINT16, ParameterType.INT16]
 TYPES = [*SMALL, ParameterType.UINT32, ParameterType.INT32, ParameterType.REAL32]
@@ -55,9 +55,9 @@ def test_bytewise_encoding_is_exact(parameter: Parameter) -> None:
 
 @given(parameters())
 def test_cast_encoding_keeps_float32_precision(parameter: Parameter) -> None:
-    wire = to_wire(parameter.value, parameter.type, bytewise=False)
-    assert wire == struct.unpack("<f", struct.pack("<f", parameter.value))[0]
-    back = from_wire(wire, parameter.type, bytewise=False)
+    sent = value_message(parameter, 900, bytewise=False)
+    assert sent.param_value == struct.unpack("<f", struct.pack("<f", parameter.value))[0]
+    back = value_of(sent, bytewise=False)
     assert type(back) is type(parameter.value)
     if parameter.type in (*SMALL, ParameterType.REAL32):
         assert back == parameter.value
@@ -72,15 +72,18 @@ def test_bytewise_encoding_matches_c(parameter: Parameter) -> None:
 
 def test_float_is_exact_except_signalling_nan() -> None:
     for value in (0, 1, -1, 2**31 - 1, -(2**31)):
-        type_ = ParameterType.INT32
-        assert from_wire(to_wire(value, type_, True), type_, True) == value
+        sent = value_message(Parameter("A", value, ParameterType.INT32), 1, bytewise=True)
+        assert value_of(ParamValue("A", sent.param_value, 6, 1, 0), bytewise=True) == value
     assert type(set_message(1, 1, "A", 5, ParameterType.INT32, True)) is ParamSet
 
 
 def test_invalid_received_value_is_returned() -> None:
-    assert math.isnan(from_wire(math.nan, ParameterType.INT8, False))
-    assert from_wire(1.5, ParameterType.INT8, False) == 1.5
-    assert from_wire(math.inf, ParameterType.REAL32, True) == math.inf
+    def received(value: float, type_: ParameterType, bytewise: bool) -> float:
+        return value_of(ParamValue("X", value, int(type_), 1, 65535), bytewise)
+
+    assert math.isnan(received(math.nan, ParameterType.INT8, False))
+    assert received(1.5, ParameterType.INT8, False) == 1.5
+    assert received(math.inf, ParameterType.REAL32, True) == math.inf
     message = ParamValue("X", math.nan, 0, 1, 65535)  # an unknown type
     assert parameter_of(message, True).type is ParameterType.REAL32
     assert parameter_of(message, True).index is None
@@ -89,8 +92,8 @@ def test_invalid_received_value_is_returned() -> None:
 def test_eight_byte_type_is_rejected() -> None:
     value = checked_value("X", 5, ParameterType.INT64)
     with pytest.raises(InvalidArgument, match="INT64"):
-        to_wire(value, ParameterType.INT64, bytewise=True)
-    assert to_wire(value, ParameterType.INT64, bytewise=False) == 5.0
+        set_message(1, 1, "X", value, ParameterType.INT64, bytewise=True)
+    assert set_message(1, 1, "X", value, ParameterType.INT64, bytewise=False).param_value == 5.0
 
 
 def test_number_too_large_for_message_is_rejected() -> None:

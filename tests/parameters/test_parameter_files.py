@@ -242,6 +242,7 @@ def test_parameter_diff() -> None:
     assert [difference.name for difference in diff({"A": 1}, {"B": 1, "C": 1})] == ["A", "B", "C"]
     assert [difference.name for difference in diff({"B": 4}, table, names={"B": 4})] == ["B"]
     assert str(diff({"A": float("nan")}, {"A": 1e300})[0]) == "A: nan → 1e+300"
+    assert str(diff({"A": 10**309}, {"A": 1.5})[0]) == f"A: {10**309} → 1.5"
 
 
 @given(tables())

@@ -136,11 +136,11 @@ def test_order_waits_for_last_sending() -> None:
 
 @pytest.mark.parametrize("command", UNREPEATABLE_COMMANDS)
 def test_unrepeatable_order_is_sent_once(command: int) -> None:
-    what, where = UNREPEATABLE_COMMANDS[command]
-    params = [0.0] * 7 if where is None else [1.0 - where[1]] * 7
-    if where is not None:
+    effect, param, value = UNREPEATABLE_COMMANDS[command]
+    params = [1.0 - value] * 7
+    if param is not None:
         assert allowed_attempts(command, params) == MAX_ATTEMPTS
-        params[where[0]] = where[1]
+        params[param - 1] = value
     order_status, now = Status(), 0.0
     message = command_long(1, 1, command, tuple(params))
     machine = CommandExchange(message, own_system=255, own_component=190, order_status=order_status)
@@ -151,7 +151,7 @@ def test_unrepeatable_order_is_sent_once(command: int) -> None:
         machine.expire(now)
     assert now == 4.0
     assert confirmations(machine) == [0]
-    assert text_of(machine).endswith(f"within 4.0 s; not sent again, because a repetition {what}")
+    assert text_of(machine).endswith(f"within 4.0 s; not sent again, because a repetition {effect}")
 
 
 def test_unrepeatable_command_without_order_is_sent_once() -> None:

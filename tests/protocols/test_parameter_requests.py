@@ -13,7 +13,7 @@ from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.message import Message
 from aerokit.parameters import Parameter, ParameterType
-from aerokit.parameters.encoding import to_wire
+from aerokit.parameters.encoding import value_message
 from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.parameter_requests import ParameterAnswer, ParameterReads, ParameterWrites, rejection
 
@@ -253,8 +253,8 @@ def test_other_type_is_accepted_when_repeated(before: list[tuple[int, int]], ask
     exchange.take_outbox()
     for number, (value_, type_) in enumerate([*before, (5, 9)]):
         if not exchange.done:
-            wire = to_wire(value_, ParameterType(type_), True)
-            exchange.receive(m.ParamValue("A", wire, type_, 1, 0xFFFF), 1.0 + number)
+            reported = Parameter("A", value_, ParameterType(type_))
+            exchange.receive(value_message(reported, 1, bytewise=True), 1.0 + number)
     assert len(exchange.take_outbox()) == asked
 
 
@@ -265,7 +265,7 @@ def test_other_value_is_accepted_when_repeated_consecutively() -> None:
     done = []
     for number, reported in enumerate((4, 5, 4, 4)):
         exchange.take_outbox()
-        exchange.receive(m.ParamValue("A", to_wire(reported, INT32, True), 6, 1, 0xFFFF), 1.0 + number)
+        exchange.receive(value_message(Parameter("A", reported, INT32), 1, bytewise=True), 1.0 + number)
         done.append(exchange.done)
     assert done == [False, False, False, True]
     assert value(exchange.result()["A"]) == 4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from aerokit.protocols.blocks import AdaptiveWindow, BlockRequests
+from aerokit.protocols.blocks import BlockRequests, CongestionWindow
 from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.request_window import FEW_LEFT, MAX_TIMEOUT_S, RequestWindow
 
@@ -87,7 +87,7 @@ def test_block_requests_back_off_after_five_timeouts() -> None:
 
 
 def test_window_grows_while_answers_are_fast() -> None:
-    window, sizes = AdaptiveWindow(start=4, min_size=2, max_size=6), list[int]()
+    window, sizes = CongestionWindow(start=4, min_size=2, max_size=6), list[int]()
     for _ in range(6):
         window.on_answer(1.0)
         sizes.append(window.size)
@@ -96,7 +96,7 @@ def test_window_grows_while_answers_are_fast() -> None:
 
 @pytest.mark.parametrize(("seconds", "size"), [(1.26, 5.0), (1.27, 4.5), (2.05, 4.5), (2.06, 4.25), (None, 4.5)])
 def test_window_shrinks_when_answers_are_slow(seconds: float | None, size: float) -> None:
-    window = AdaptiveWindow(start=4)
+    window = CongestionWindow(start=4)
     window.on_answer(1.0)
     window.on_answer(seconds)
     assert window._size == size
@@ -104,7 +104,7 @@ def test_window_shrinks_when_answers_are_slow(seconds: float | None, size: float
 
 def test_window_halves_at_high_loss() -> None:
     """The average loss (1/16 for each message) exceeds 3/4 after 22 losses from 0, and after 11 losses from 1/2."""
-    window, sizes = AdaptiveWindow(start=40, min_size=8), list[int]()
+    window, sizes = CongestionWindow(start=40, min_size=8), list[int]()
     for _ in range(60):
         window.on_loss()
         sizes.append(window.size)
@@ -112,7 +112,7 @@ def test_window_halves_at_high_loss() -> None:
 
 
 def test_window_keeps_size_at_moderate_loss() -> None:
-    window = AdaptiveWindow(start=40)
+    window = CongestionWindow(start=40)
     for _ in range(500):
         for _ in range(2):
             window.on_loss()
@@ -122,6 +122,6 @@ def test_window_keeps_size_at_moderate_loss() -> None:
 
 @pytest.mark.parametrize(("fit", "size"), [(3.0, 4), (4.0, 4), (9.0, 9), (32.0, 32), (33.0, 32)])
 def test_window_widens_up_to_half_maximum(fit: float, size: int) -> None:
-    window = AdaptiveWindow()
+    window = CongestionWindow()
     window.widen(fit)
     assert window.size == size

@@ -11,6 +11,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavModeFlag
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle
 
 M = TypeVar("M", bound=Message)
@@ -23,7 +24,7 @@ PX4_HOME = (47.3977432, 8.5455939, 489.4)
 class Client:
     def __init__(self, vehicle: SimulatedVehicle, *, system_id: int = 255, component_id: int = 190) -> None:
         self.vehicle = vehicle
-        self.target = (vehicle.system_id, vehicle.component_id)
+        self.target = ComponentIds(vehicle.system_id, vehicle.component_id)
         self.now = 0.0
         self.received: list[tuple[float, Message]] = []
         self.framer = Framer()

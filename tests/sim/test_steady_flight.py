@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from simulated_client import Client, flying_copter, set_mode
 
+from aerokit.mavlink import Message
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, SimulatedWind
@@ -85,7 +86,7 @@ def test_change_of_acceleration_is_followed_by_short_ticks(fly: Take) -> None:
 @pytest.mark.parametrize(
     ("message", "is_short"), [(m.ParamRequestRead(1, 1, "X", -1), True), (m.Heartbeat(6, 8, 0, 0, 4, 3), False)]
 )
-def test_next_tick_is_short_unless_the_message_is_a_heartbeat(fly: Take, message: m.Message, is_short: bool) -> None:
+def test_next_tick_is_short_unless_the_message_is_a_heartbeat(fly: Take, message: Message, is_short: bool) -> None:
     vehicle, client = fly()
     ticks = recorded_ticks(vehicle)
     sent_at = client.now

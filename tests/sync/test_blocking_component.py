@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import pytest
 
@@ -142,7 +142,7 @@ def test_parameters_and_missions_are_used_from_the_program() -> None:
 def test_mission_function_runs_in_thread_but_loop_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     threads: dict[str, str] = {}
 
-    def send(self: ComponentHost, message: Message, *arguments: object) -> None:
+    def send(self: ComponentHost, message: Message, *arguments: Any) -> None:
         threads[message.NAME] = threading.current_thread().name
         send_on_loop(self, message, *arguments)
 

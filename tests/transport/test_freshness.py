@@ -18,7 +18,7 @@ from aerokit.transport.zenoh.control_lease import (
     FreshnessChecker,
     VehicleSideTracker,
 )
-from aerokit.transport.zenoh.keys import Beacon, Stamp
+from aerokit.transport.zenoh.keys import Beacon, SendTime, Stamp
 
 Event = tuple[float, int, str, Any]
 Holds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]
@@ -79,8 +79,12 @@ class SimulatedNetwork:
                     self.at(self.arrival(now, 1), "came", (now, stamp))
             else:
                 sent, stamp = what
-                accepted = self.checker.accepts("ground", stamp, vehicle)
+                accepted = accepts(self.checker, stamp, vehicle)
                 (self.accepted if accepted else self.refused).append((sent, now))
+
+
+def accepts(checker: FreshnessChecker, stamp: Stamp | None, now: float) -> bool:
+    return checker.is_fresh(stamp, now) and stamp is not None and checker.is_new("ground", stamp)
 
 
 @given(clocks, clocks, st.lists(delays, min_size=120, max_size=120))
@@ -128,7 +132,7 @@ def test_nothing_is_sent_in_silence_and_held_back_refused() -> None:
     held = tracker.make_stamp(1.9)
     assert held is not None
     assert tracker.make_stamp(2.1) is None  # the beacon is too old by our own clock
-    assert not checker.accepts("ground", held, 102.1)
+    assert not accepts(checker, held, 102.1)
     assert checker.late == 1
     beacon = checker.make_beacon(110.0)
     assert not tracker.receive_beacon(beacon, 20.0)  # ten seconds late: it was held back, too
@@ -136,8 +140,8 @@ def test_nothing_is_sent_in_silence_and_held_back_refused() -> None:
     assert tracker.make_stamp(20.0) is None
     assert tracker.receive_beacon(checker.make_beacon(120.0), 20.0)
     fresh = tracker.make_stamp(20.1)
-    assert checker.accepts("ground", fresh, 120.1)
-    assert not checker.accepts("ground", fresh, 120.1)  # the same once more
+    assert accepts(checker, fresh, 120.1)
+    assert not accepts(checker, fresh, 120.1)  # the same once more
     assert checker.duplicates == 1
 
 
@@ -145,13 +149,13 @@ def test_second_vehicle_side_with_same_name() -> None:
     first, second, tracker = FreshnessChecker(1), FreshnessChecker(2), VehicleSideTracker(1)
     assert tracker.receive_beacon(first.make_beacon(0.0), 0.0)
     assert not tracker.receive_beacon(second.make_beacon(50.0), 0.1)  # the first one is active
-    assert not tracker.accepts(2, 50.0, 0.1)
+    assert not tracker.accepts(SendTime(2, 50.0), 0.1)
     assert tracker.foreign == 2
     stamp = tracker.make_stamp(0.2)
-    assert first.accepts("ground", stamp, 0.2)
-    assert not second.accepts("ground", stamp, 50.2)
+    assert accepts(first, stamp, 0.2)
+    assert not accepts(second, stamp, 50.2)
     assert tracker.receive_beacon(second.make_beacon(53.0), 3.0)  # the first one is silent: this is its successor
-    assert second.accepts("ground", tracker.make_stamp(3.1), 53.1)
+    assert accepts(second, tracker.make_stamp(3.1), 53.1)
     tracker.reset()
     assert tracker.make_stamp(3.2) is None
     assert tracker.receive_beacon(first.make_beacon(3.3), 3.3)
@@ -161,16 +165,16 @@ def test_second_vehicle_side_with_same_name() -> None:
 def test_datagram_without_valid_stamp_is_refused(stamp: Stamp | None) -> None:
     checker = FreshnessChecker(7)
     checker.make_beacon(0.0)
-    assert not checker.accepts("ground", stamp, 0.1)
+    assert not accepts(checker, stamp, 0.1)
     assert checker.late == 1
-    assert checker.accepts("ground", Stamp(7, 1, 1, 1), 0.1)
+    assert accepts(checker, Stamp(7, 1, 1, 1), 0.1)
 
 
 def test_checker_bounds_remembered_clients() -> None:
     checker = FreshnessChecker(7)
     checker.make_beacon(0.0)
     for nonce in range(1000):
-        assert checker.accepts("ground", Stamp(7, 1, nonce, 1), 0.1)
+        assert accepts(checker, Stamp(7, 1, nonce, 1), 0.1)
     assert len(checker._sequences) == 256
 
 

@@ -34,7 +34,7 @@ class ManualTransport:
         self.pending, self.room, self.dropped = 0, room, 0
         self.events: list[bool] = []
         self.outbox = Outbox(
-            self._take, lambda: self.pending, limit=limit, dropped=self._drop, stalled=self.events.append
+            self._take, lambda: self.pending, limit=limit, on_dropped=self._drop, on_stalled=self.events.append
         )
 
     def _take(self, data: bytes) -> None:

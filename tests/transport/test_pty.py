@@ -88,7 +88,7 @@ def test_closed_pty_is_not_polled() -> None:
     async def close() -> None:
         link = PtyLink()
         await link.open(RecordingReceiver())
-        ours = link._ends[0]
+        ours = link._our_end
         link.close()
         await link.wait_closed()
         assert not asyncio.get_running_loop().remove_reader(ours)

@@ -24,7 +24,7 @@ from aerokit.mavlink.messages import CommandLong, Heartbeat, ParamRequestList, S
 from aerokit.transport import create_link
 from aerokit.transport import link as needed
 from aerokit.transport.zenoh import listen as zenoh_listen
-from aerokit.transport.zenoh.keys import RefusalNotice, Stamp, encode_sent_at
+from aerokit.transport.zenoh.keys import RefusalNotice, SendTime, Stamp
 from aerokit.transport.zenoh.listen import CLIENT_TIMEOUT_S, MAX_CLIENTS, ZenohListen
 from aerokit.transport.zenoh.session import LoopQueue
 
@@ -123,8 +123,8 @@ async def test_name_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
                 monkeypatch.context() as patched,
                 pytest.raises(LinkOpenError, match="another program serves this name"),
             ):
-                patched.setattr(zenoh_listen, "_RIVAL_QUERY_TIMEOUT_S", 100.0)
-                patched.setattr(zenoh_listen, "_RIVAL_TIMEOUT_S", 100.0)
+                patched.setattr(zenoh_listen, "_TOKEN_QUERY_TIMEOUT_S", 100.0)
+                patched.setattr(zenoh_listen, "_BEACON_TIMEOUT_S", 100.0)
                 async with serving(port, how="connect"):
                     pass
         with anyio.fail_after(100):
@@ -474,7 +474,7 @@ async def test_payload_larger_than_datagram_is_ignored() -> None:
     async with serving(port) as (vehicle, recorder), client(port, "&client=ground") as (link, answered):
         link.write(order := frame(ParamRequestList(1, 1)))
         await recorder.until_data(order)
-        stamp, sent = link._tracker.make_stamp(link._now()), encode_sent_at(vehicle._freshness.epoch, vehicle._now())
+        stamp, sent = link._tracker.make_stamp(link._now()), SendTime(vehicle._freshness.epoch, vehicle._now()).encode()
         assert stamp is not None
         for session, key, attachment in (
             (link._session, link._keys.to_vehicle("ground"), stamp.encode()),
@@ -499,7 +499,7 @@ async def test_declarations_of_abandoned_opening_are_ignored() -> None:
     """A thread cannot be stopped, so it may declare when the link is already opened again."""
     client_link = create_link("zenoh://north/alpha")
     vehicle = ZenohListen("north", "alpha")
-    for link, declare in ((client_link, "_declare"), (vehicle, "_find_rivals")):
+    for link, declare in ((client_link, "_declare"), (vehicle, "_find_conflict")):
         present: Any = link
         present._queue = LoopQueue()
         getattr(present, declare)(LoopQueue(), MagicMock(), MagicMock())
@@ -514,12 +514,12 @@ async def test_refused_name_can_be_served_later(monkeypatch: pytest.MonkeyPatch)
     link = ZenohListen("north", "alpha")
 
     async def open_session(*_: object) -> Any:
-        link._zenoh, link._may_have_rival = pytest.importorskip("zenoh"), True
+        link._zenoh, link._may_have_conflict = pytest.importorskip("zenoh"), True
         return MagicMock()
 
     monkeypatch.setattr(zenoh_listen, "open_session", open_session)
-    monkeypatch.setattr(zenoh_listen, "_RIVAL_TIMEOUT_S", 0.001)
-    link._rival_found.set()
+    monkeypatch.setattr(zenoh_listen, "_BEACON_TIMEOUT_S", 0.001)
+    link._name_conflict.set()
     await link.open(Recorder())
     link.close()
     await link.wait_closed()
@@ -540,7 +540,7 @@ async def test_failed_declaration_is_open_error(monkeypatch: pytest.MonkeyPatch)
     await link.wait_closed()
 
 
-async def test_notice_for_namesake_is_ignored() -> None:
+async def test_notice_for_other_program_is_ignored() -> None:
     link: Any = create_link("zenoh://north/alpha?client=ground")
     link._receiver = recorder = RefusalRecorder()
     for nonce in (link._nonce ^ 1, link._nonce, None):

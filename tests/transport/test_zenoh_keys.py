@@ -11,10 +11,9 @@ from aerokit.transport.zenoh.keys import (
     Beacon,
     KeySpace,
     RefusalNotice,
+    SendTime,
     Stamp,
     check_name,
-    decode_sent_at,
-    encode_sent_at,
 )
 
 u32 = st.integers(0, 2**32 - 1)
@@ -63,10 +62,10 @@ def test_notice_without_text_is_none(field: str) -> None:
 
 @given(u32, st.floats(0, 1e9))
 def test_send_time_round_trip(epoch: int, clock: float) -> None:
-    read = decode_sent_at(encode_sent_at(epoch, clock))
+    read = SendTime.decode(SendTime(epoch, clock).encode())
     assert read is not None
-    assert read[0] == epoch
-    assert read[1] == pytest.approx(clock, abs=0.001)
+    assert read.epoch == epoch
+    assert read.clock_s == pytest.approx(clock, abs=0.001)
 
 
 json_values = st.recursive(
@@ -85,14 +84,14 @@ def test_decoding_never_raises(data: bytes) -> None:
     Beacon.decode(data)
     RefusalNotice.decode(data)
     Stamp.decode(data)
-    decode_sent_at(data)
+    SendTime.decode(data)
 
 
 def test_other_version_is_ignored() -> None:
     beacon = Beacon(1, 1, 1.0)
     assert Beacon.decode(beacon.encode().replace(b'"version":1', b'"version":2')) is None
     assert Stamp.decode(b"\x02" + Stamp(1, 1, 1, 1).encode()[1:]) is None
-    assert decode_sent_at(b"\x02" + encode_sent_at(1, 1.0)[1:]) is None
+    assert SendTime.decode(b"\x02" + SendTime(1, 1.0).encode()[1:]) is None
 
 
 @pytest.mark.parametrize("clock", ["NaN", "Infinity", "-Infinity", "1" + 400 * "0"])

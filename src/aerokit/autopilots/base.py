@@ -248,6 +248,8 @@ class Autopilot:
     """True if the mode changes to the hold mode at the end of a mission."""
     mission_end_text: str | None = None
     """Part of the status text at the end of a mission, but not of a mission that is invalid."""
+    no_mission_text: str | None = None
+    """Part of the status text of a vehicle that enters its mission mode without a mission to fly."""
     mission_starts_by_command = False
     """True if MAV_CMD_MISSION_START (300) starts the mission even on the ground. The command does not arm."""
     sets_current_by_command = False

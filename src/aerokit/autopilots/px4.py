@@ -120,6 +120,8 @@ class Px4(Autopilot):
     reposition_purpose: Purpose = "hold"
     holds_after_mission = True
     mission_end_text: str | None = "Mission finished"  # mission_base.cpp
+    # mission_base.cpp, update_mission. A finished mission is not flown again before an item is selected.
+    no_mission_text: str | None = "No valid mission available"
     prearm_depends_on_mode = True
     # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
     runs_prearm_checks = True

@@ -62,8 +62,8 @@ class Bus:
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
-        self.one_at_a_time = False
-        """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the next ones."""
+        self.must_check_frames = False
+        """True if the owner must check each frame before its delivery. :meth:`deliver_all` then stops early."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}  # the key is (system id, message id)
         self._plans: dict[int, _DeliveryPlan] = {}  # cache; the key is system id << 24 | message id
@@ -134,10 +134,10 @@ class Bus:
     def deliver_all(
         self, frames: Iterable[Frame], before_heartbeat: Callable[..., None], *context: object
     ) -> Frame | None:
-        """Deliver the frames in order, like :meth:`deliver`, until a sink sets :attr:`one_at_a_time`.
+        """Deliver the frames in order, like :meth:`deliver`. Stop after a frame whose sink sets `must_check_frames`.
 
-        Returns the frame whose sink set it, or None if no sink did. Calls ``before_heartbeat(frame, *context)`` before
-        each HEARTBEAT is delivered.
+        Returns this frame, or None if no sink did. Calls ``before_heartbeat(frame, *context)`` before each HEARTBEAT is
+        delivered.
         """
         plans, decode = self._plans, self.dialect.decode
         for frame in frames:
@@ -157,7 +157,7 @@ class Bus:
                         sink(item)
                     except Exception:
                         _report(sink)
-            if self.one_at_a_time:
+            if self.must_check_frames:
                 return frame
         return None
 
@@ -291,7 +291,7 @@ class EndSignal:
         """Call ``callback(error)`` when the owner ends, or immediately if the owner has already ended."""
         if self.error is not None:
             callback(self.error)
-            return _nothing
+            return lambda: None
         self._callbacks.append(callback)
 
         def detach() -> None:
@@ -308,10 +308,6 @@ class EndSignal:
                 callback(error)
             except Exception:
                 logger.exception("a callback of on_end() raised an exception; the other callbacks are still called")
-
-
-def _nothing() -> None:
-    pass
 
 
 ItemT = TypeVar("ItemT")

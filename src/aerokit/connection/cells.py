@@ -65,10 +65,10 @@ class StateCell(Generic[T]):
         "_close_error",
         "_explain_timeout",
         "_feeds",
-        "_followers",
+        "_iterator_count",
         "_known",
         "_latest",
-        "_sinks",
+        "_listeners",
         "_source",
         "_stamp",
         "_updated_at",
@@ -98,9 +98,9 @@ class StateCell(Generic[T]):
         self._updated_at = -math.inf
         self._arrivals = 0  # number of values set so far
         self._changes = 0  # number of values that differed from the value before
-        # Waiters and observers. A new tuple replaces this one, because a sink that is called may add or remove sinks.
-        self._sinks: tuple[_Sink[T], ...] = ()
-        self._followers = 0  # number of iterators
+        # Waiters and observers. Changes replace the tuple, because a called listener may add or remove listeners.
+        self._listeners: tuple[_Listener[T], ...] = ()
+        self._iterator_count = 0
         self._feeds: tuple[Feed, ...] = ()  # decode pending messages before the cell is read
         self._close_error: BaseException | None = None  # set when no more values will arrive
 
@@ -226,8 +226,8 @@ class StateCell(Generic[T]):
         self._source = source
         self._updated_at = self._stamp()
         self._arrivals += 1
-        for sink in self._sinks:
-            sink.receive(value)
+        for listener in self._listeners:
+            listener.receive(value)
 
     def _add_age(self, seconds: float) -> None:
         self._catch_up()
@@ -239,22 +239,22 @@ class StateCell(Generic[T]):
         self._known = False
         self._source = None
         self._updated_at = -math.inf
-        for sink in self._sinks:
-            sink.forget()
+        for listener in self._listeners:
+            listener.forget()
 
     def _feed_from(self, *feeds: Feed) -> None:
         self._feeds = feeds
 
     @property
     def _is_watched(self) -> bool:
-        return bool(self._followers or self._sinks)
+        return bool(self._iterator_count or self._listeners)
 
     def close(self, error: BaseException) -> None:
         """Raise ``error`` in current and later waiters, because no more values will arrive. Reading still works."""
         if self._close_error is None:
             self._close_error = error
-            for sink in self._sinks:
-                sink.fail(copy_exception(error))
+            for listener in self._listeners:
+                listener.fail(copy_exception(error))
 
     def _raise_if_closed(self) -> None:
         if self._close_error is not None:
@@ -265,22 +265,22 @@ class StateCell(Generic[T]):
             if feed.pending:
                 feed.catch_up()
 
-    def _add(self, sink: _Sink[T]) -> None:
+    def _add(self, listener: _Listener[T]) -> None:
         self._catch_up()
-        self._sinks += (sink,)
+        self._listeners += (listener,)
         self._notify_feeds()
 
-    def _remove(self, sink: _Sink[T]) -> None:
-        self._sinks = tuple(other for other in self._sinks if other is not sink)
+    def _remove(self, listener: _Listener[T]) -> None:
+        self._listeners = tuple(other for other in self._listeners if other is not listener)
         self._notify_feeds()
 
-    def _follow(self) -> None:
+    def _add_iterator(self) -> None:
         self._catch_up()
-        self._followers += 1
+        self._iterator_count += 1
         self._notify_feeds()
 
-    def _unfollow(self) -> None:
-        self._followers -= 1
+    def _remove_iterator(self) -> None:
+        self._iterator_count -= 1
         self._notify_feeds()
 
     def _notify_feeds(self) -> None:
@@ -322,7 +322,7 @@ class Changes(AsyncIterator[T]):
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:
         self._loop = asyncio.get_running_loop()  # `__del__` needs it, and may run on another thread.
-        cell._follow()
+        cell._add_iterator()
         self._cell = cell
         self._every_arrival = every_arrival
         # Number of values read so far, counted as `_total` does. The current value counts as unread, because iteration
@@ -335,10 +335,10 @@ class Changes(AsyncIterator[T]):
         if not hasattr(self, "_cell"):  # __init__ raised.
             return
         if asyncio._get_running_loop() is self._loop:
-            self._cell._unfollow()
+            self._cell._remove_iterator()
         else:  # In the blocking API, or if the collector runs on another thread.
             with suppress(RuntimeError):  # The event loop may be closed.
-                self._loop.call_soon_threadsafe(self._cell._unfollow)
+                self._loop.call_soon_threadsafe(self._cell._remove_iterator)
 
     @property
     def missed(self) -> int:
@@ -367,8 +367,8 @@ class Changes(AsyncIterator[T]):
         await waiter.wait(None, "")
 
 
-class _Sink(Generic[T]):
-    """Receiver of the notifications of a cell."""
+class _Listener(Generic[T]):
+    """Gets the values of a cell."""
 
     __slots__ = ()
 
@@ -380,7 +380,7 @@ class _Sink(Generic[T]):
     def fail(self, error: BaseException) -> None: ...
 
 
-class _Waiter(_Sink[T]):
+class _Waiter(_Listener[T]):
     """One call of ``wait_until``: a future for the result, and a timer that measures ``held_for``."""
 
     __slots__ = (
@@ -473,7 +473,7 @@ class _Waiter(_Sink[T]):
         return f"{text}; {reason}" if reason else text
 
 
-class _Observer(_Sink[T]):
+class _Observer(_Listener[T]):
     """A callback registered by ``observe``."""
 
     __slots__ = ("_callback", "_cell", "_every_arrival", "_previous")
@@ -496,5 +496,5 @@ class _Observer(_Sink[T]):
         self._previous = None
 
     def close(self) -> None:
-        if self in self._cell._sinks:
+        if self in self._cell._listeners:
             self._cell._remove(self)

@@ -24,7 +24,7 @@ from aerokit.connection.heartbeats import (
 )
 from aerokit.connection.loop_watch import loop_clock
 from aerokit.connection.routes import EVERY_PEER, MAX_ROUTES, Routes
-from aerokit.connection.signatures import SignatureGate
+from aerokit.connection.signatures import SignatureFilter
 from aerokit.connection.tasks import BackgroundTasks, Deadlines
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.events import (
@@ -116,20 +116,20 @@ class Connection:
         self._clock = loop_clock()
         self._unix_epoch_s = time.time() - self._clock()  # seconds since 1970 at loop time 0
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
-        self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
+        self._signatures = SignatureFilter(self._encoder, self.unix_time, self.bus.publish)
         self.signing = signing
         make_routes = partial(Routes, link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
         # None with a single link; otherwise the same object as `_routes`.
         self._multilink = self._make_multilink(make_routes) if link.is_multilink else None
         self._routes: Routes | MultiLinkRoutes = self._multilink or make_routes()
-        self._receiver = FrameReceiver(link, self.bus, self._routes, self._multilink, self._gate, self._clock)
+        self._receiver = FrameReceiver(link, self.bus, self._routes, self._multilink, self._signatures, self._clock)
         self._observers = self._receiver.observers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = self._receiver.heartbeats
         """Last HEARTBEAT of every (system id, component id) on the link."""
         self.keeps_peers = True  # read by the link; see `aerokit.transport.link.PeerKeeper`
         self._background = BackgroundTasks(self.fail)
         self._owns_link = True  # False if the link turns out to belong to another connection
-        self._state_watch = LinkStateTracker(self.link_state, self.bus, system_id=0)
+        self._state_tracker = LinkStateTracker(self.link_state, self.bus, system_id=0)
         self._end_signal = EndSignal()
         # None if this program sends no heartbeat.
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
@@ -243,7 +243,7 @@ class Connection:
     @mavlink_version.setter
     def mavlink_version(self, version: int) -> None:
         _check_version(version)
-        self._gate.check_version(version)
+        self._signatures.check_version(version)
         self._encoder.version = version
 
     @property
@@ -257,7 +257,7 @@ class Connection:
 
     @signing.setter
     def signing(self, signing: Signing | None) -> None:
-        self._gate.set_signing(signing)
+        self._signatures.set_signing(signing)
 
     @checked
     def subscribe(
@@ -395,7 +395,7 @@ class Connection:
         With a signing key, the hint counts the refused frames of all senders. Without a key, it says that the last
         heartbeat of this component was signed. ``component_id`` 0 means any component of the system.
         """
-        return self._gate.describe(
+        return self._signatures.describe(
             heartbeat
             for (system, component), heartbeat in self.heartbeats.items()
             if system == system_id and component_id in (0, component)
@@ -454,13 +454,13 @@ class Connection:
 
     def link_interrupted(self, error: LinkLost) -> None:
         """Called when the link was lost and is being reopened."""
-        self._state_watch.mark_lost(self._clock())
+        self._state_tracker.mark_lost(self._clock())
         self.bus.publish(LinkInterrupted(self._clock(), system_id=0, error=error))
 
     def link_restored(self, away_s: float) -> None:
         """Called when the link is open again after an interruption."""
         self._receiver.reset()
-        self._state_watch.record_activity(self._clock())
+        self._state_tracker.record_activity(self._clock())
         self.bus.publish(LinkRestored(self._clock(), system_id=0, away_s=away_s))
 
     def link_stalled(self, unsent_bytes: int) -> None:
@@ -487,7 +487,7 @@ class Connection:
             self._multilink.link_open_failed(link, error)
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
-        """Called when the vehicle side of a zenoh network refused one of our commands."""
+        """Called when the other end of a zenoh link refused one of our commands."""
         refusal = OrderRefused(self._clock(), system_id=0, message=message, reason=reason, lease_holder=lease_holder)
         self.bus.publish(refusal)
         for answer in answers:  # The answers bypass the framers, which would count them as frames of the link.
@@ -512,7 +512,7 @@ class Connection:
 
     def _start(self) -> None:
         """Start the tasks that run until the connection ends."""
-        self._state_watch.record_activity(self._clock())
+        self._state_tracker.record_activity(self._clock())
         self._receiver.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
         if self._multilink is not None:
@@ -522,8 +522,8 @@ class Connection:
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
-            self._gate.log_storage_errors()
-            self._state_watch.update(self._clock(), sum(counters.frames for counters in self.statistics()))
+            self._signatures.log_storage_errors()
+            self._state_tracker.update(self._clock(), sum(counters.frames for counters in self.statistics()))
             self._observers.flush()
             await anyio.sleep(HEARTBEAT_INTERVAL_S)
 
@@ -535,7 +535,7 @@ class Connection:
         self._receiver.close()
         self._observers.flush()  # The task that flushes regularly ends below, and the program may run on for hours.
         # Only a lost link is published as an event: a program that closes the connection itself needs none.
-        self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
+        self._state_tracker.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
         if self._multilink is not None:
             self._multilink.status.close(error)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Bus
     from aerokit.connection.multilink.routes import MultiLinkRoutes
     from aerokit.connection.routes import Routes
-    from aerokit.connection.signatures import SignatureGate
+    from aerokit.connection.signatures import SignatureFilter
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.statistics import FramerStatistics
@@ -139,10 +139,10 @@ class FrameReceiver:
         bus: Bus,
         routes: Routes | MultiLinkRoutes,
         multilink: MultiLinkRoutes | None,
-        gate: SignatureGate,
+        signatures: SignatureFilter,
         clock: Callable[[], float],
     ) -> None:
-        self._bus, self._gate, self._clock = bus, gate, clock
+        self._bus, self._signatures, self._clock = bus, signatures, clock
         self._routes, self._multilink = routes, multilink
         self._peers = PeerTable(link, bus.dialect, routes.evict_idle_peer, self._update_framer)
         self.framers: dict[Peer, Framer] = self._peers.framers
@@ -151,8 +151,8 @@ class FrameReceiver:
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
         self._is_closed = False  # True once the connection has ended; frames are then dropped
-        bus.one_at_a_time = multilink is not None  # Frames of several links are checked one by one.
-        gate.on_change = self._update_checks
+        bus.must_check_frames = multilink is not None
+        signatures.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
 
     def start(self) -> None:
@@ -184,39 +184,41 @@ class FrameReceiver:
             self._update_checks()
         if not frames:
             return
-        if self._bus.one_at_a_time or framer.late or framer.foreign:
+        if self._bus.must_check_frames or framer.late or framer.foreign:
             self._check_and_deliver(frames, framer, peer)
             return
         # Frames that need no checks are delivered together.
         last_delivered = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
         if last_delivered is not None:
-            # The delivery stopped after this frame, because one of its sinks closed the connection, set a signing key
-            # or added an observer. The other frames now need checks. This frame was not yet passed to the observers.
+            # One of the sinks of this frame closed the connection, set a signing key or added an observer. The other
+            # frames now need checks. This frame was not yet passed to the observers.
             self.observers.notify_received(last_delivered, peer)
             # Frames are compared by identity, so that an equal frame earlier in the list is not taken for this one.
             remaining = frames[frames.index(last_delivered) + 1 :]
             self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
-        framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
+        framers, multilink, signatures, observers = self.framers, self._multilink, self._signatures, self.observers
         # True if frames arrived out of order (late), or may be those of a second sender with the same ids (foreign).
         has_suspects = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # A sink of an earlier frame has closed the connection.
                 return
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
-            if multilink is not None and multilink.is_copy(frame, peer, is_other_peer=is_other_peer):
+            if multilink is not None and multilink.is_duplicate(frame, peer, is_other_peer=is_other_peer):
                 continue
-            # With several links, `_is_admitted` is called even if the gate is open, because it records the admission.
-            must_check = multilink is not None or not gate.is_open
+            # With several links, `_is_admitted` is always called, because it records the admission.
+            must_check = multilink is not None or not signatures.admits_all
             if must_check and not self._is_admitted(frame, is_other_peer):
                 continue
             # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that
             # are not in use.
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
-            if is_other_peer and not self._claims_route(framer, frame, peer):
-                continue
+            if is_other_peer:
+                is_signed = signatures.has_verified(frame)
+                if not self._routes.try_move_route(frame, peer, is_signed=is_signed):
+                    continue
             if has_suspects and self._must_be_dropped(framer, frame):
                 continue
             if multilink is not None:
@@ -267,10 +269,10 @@ class FrameReceiver:
         self._routes.exclude_pause(self._clock(), paused_s)
 
     def _update_checks(self) -> None:
-        self._bus.one_at_a_time = (
+        self._bus.must_check_frames = (
             self._is_closed
             or self._multilink is not None
-            or not self._gate.is_open
+            or not self._signatures.admits_all
             or self.observers.want_all
             or len(self.framers) > 1
         )
@@ -285,17 +287,12 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # If the same frame was admitted over another link, it is not checked again, because the check would refuse it
-        # as a replay. `copies` still refers to this frame, because `is_copy` was just called for it.
-        if self._multilink is not None and self._multilink.copies.was_admitted:
-            return True
-        is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
-        if is_admitted and self._multilink is not None:
-            self._multilink.copies.admit()
-        return is_admitted
-
-    def _claims_route(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
-        return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
+        if self._multilink is None:
+            return self._signatures.admits(frame, may_hand_over=not is_other_peer)
+        current = self._multilink.copies.current  # the record of this frame
+        if not current.is_admitted:  # A second check of an admitted frame would refuse it as a replay.
+            current.is_admitted = self._signatures.admits(frame, may_hand_over=not is_other_peer)
+        return current.is_admitted
 
     def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:
         """Return True for frames of a second sender with the same ids, and for outdated heartbeats."""

@@ -172,10 +172,6 @@ class LinkStateTracker:
         self._source = Source(system_id, component_id, "link")
         self._frames = 0  # number of frames at the last update
 
-    @property
-    def state(self) -> LinkState | None:
-        return self._cell.latest
-
     def record_activity(self, at: float) -> None:
         """Record that something was received, which makes the state CONNECTED."""
         self._active_at = at

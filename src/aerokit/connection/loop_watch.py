@@ -83,9 +83,9 @@ class LoopWatch:
         """Earliest possible receive time of data that is read now; infinite if the data cannot have waited."""
         # The last times at which the computer woke, with the seconds for which it was suspended.
         self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
-        # While waiting data is read, the next time at which `arrival` checks for a suspension, which is slow.
+        # While catching up, the next time at which `arrival` checks for a suspension, which is slow.
         self._check_sleep_at = -math.inf
-        self._has_read = False  # True if data was read since the last call of `_end_assumption_when_idle`
+        self._has_read = False  # True if data was read since the last call of `_stop_catching_up_when_idle`
         self._idle_iterations = 0  # number of consecutive loop iterations in which nothing was read
 
     def start(self) -> None:
@@ -116,13 +116,13 @@ class LoopWatch:
                 self._set_timer(now)
             return now
         self._has_read = True
-        return self._assume_waiting_data()
+        return self._start_catching_up()
 
     def slept_since(self, at: float) -> float:
         """Return how many seconds the computer was suspended since this loop time."""
         # The timer may notice a suspension 0.2 s late.
         if self._timer is not None and self._detect_sleep():
-            self._assume_waiting_data()
+            self._start_catching_up()
         return sum(seconds for woke_at, seconds in self._sleeps if woke_at > at)
 
     def _tick(self) -> None:
@@ -132,7 +132,7 @@ class LoopWatch:
         if self._timer is None:  # A sink of ComputerSlept has closed the connection.
             return
         if has_slept or late_s > LATE_THRESHOLD_S:
-            self._assume_waiting_data()
+            self._start_catching_up()
         self._set_timer(now)
         # The pause may have begun just after the timer was set, so its maximum length is reported.
         if late_s > BLOCKED_THRESHOLD_S:
@@ -159,22 +159,22 @@ class LoopWatch:
             self.late_after = now + CHECK_INTERVAL_S / 2
         self._timer = self._loop.call_at(self._due, self._tick)
 
-    def _assume_waiting_data(self) -> float:
-        """Assume that data arrived during the pause, and return its earliest possible receive time."""
+    def _start_catching_up(self) -> float:
+        """Start reading the data that may have arrived during the pause. Return its earliest possible receive time."""
         if self.oldest_arrival == math.inf:
             self.oldest_arrival = self._ran_at
             self.late_after = -math.inf
             self._idle_iterations = 0
-            self._loop.call_soon(self._end_assumption_when_idle)
+            self._loop.call_soon(self._stop_catching_up_when_idle)
         return self.oldest_arrival
 
-    def _end_assumption_when_idle(self) -> None:
+    def _stop_catching_up_when_idle(self) -> None:
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:  # The connection is closed.
             return
         if self._idle_iterations < MIN_IDLE_ITERATIONS:
-            self._loop.call_soon(self._end_assumption_when_idle)
+            self._loop.call_soon(self._stop_catching_up_when_idle)
         else:
             caught_up_after_s = self._loop.time() - self.oldest_arrival
             self.oldest_arrival = math.inf

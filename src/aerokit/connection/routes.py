@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from aerokit.events import DuplicateSender, RouteChanged, RouteChangeRefused
 from aerokit.mavlink.enums import MavComponent
@@ -24,26 +24,17 @@ if TYPE_CHECKING:
 # ATTITUDE_QUATERNION, LOCAL_POSITION_NED and GLOBAL_POSITION_INT.
 _BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 
-CLAIM_MIN_FRAMES = 3
+MIN_TAKEOVER_FRAMES = 3
 
 
-class Evidence(NamedTuple):
-    """Comparison of a frame from another peer with the stream of the route's owner. None means unknown."""
+class OtherPeer:
+    """A peer that sends with the ids of a component, although another peer owns the component's route.
 
-    expected: int  # the owner's next sequence number
-    sequence_matches: bool | None
-    clock_matches: bool | None
-
-
-class RouteClaim:
-    """Evidence on whether a component now sends from another peer of the link.
-
-    The owner of a route is the peer to which messages for the component are sent. Another peer that sends with the ids
-    of the component claims the route. When the owner sends again, the claim starts anew.
+    The owner of a route is the peer to which messages for the component are sent.
     """
 
     __slots__ = (
-        "_claimed_at",
+        "_began_at",
         "_clock_matches",
         "_expected",
         "_frames",
@@ -53,25 +44,27 @@ class RouteClaim:
     )
 
     def __init__(self) -> None:
-        self._expected: int | None = None  # next sequence number of the owner when the claim was made
-        # True if the peer's sequence numbers and time since boot continue the owner's stream; None if unknown.
+        self._expected: int | None = None  # next sequence number of the owner when this peer began to send
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
         # Number of the peer's frames since the owner's last frame, and the time of the first of them.
-        self._frames, self._claimed_at = 0, 0.0
+        self._frames, self._began_at = 0, 0.0
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
 
-    def add(self, frame: Frame, evidence: Evidence) -> None:
-        expected, sequence_matches, clock_matches = evidence
-        if expected != self._expected:  # The owner has sent frames since the last call, so the claim starts again.
+    def add(self, frame: Frame, expected: int, sequence_matches: bool | None, clock_matches: bool | None) -> None:
+        """Record a frame, and whether its sequence number and time since boot fit the owner's frames (None: unknown).
+
+        ``expected`` is the owner's next sequence number.
+        """
+        if expected != self._expected:  # The owner has sent frames since the last call, so the comparison starts again.
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
             # Only the first frame's sequence number counts. Otherwise a peer could try until a number matches.
             self._sequence_matches = sequence_matches
             self._clock_matches = None
-            self._claimed_at = frame.received_at
+            self._began_at = frame.received_at
         self._frames += 1
         # A mismatch of the clock is final. Otherwise another sender could try often enough until a frame matches by
         # chance.
@@ -79,27 +72,18 @@ class RouteClaim:
             self._clock_matches = clock_matches
 
     @property
-    def continues_owner(self) -> bool:
-        """True if the evidence proves that the owner itself sends from the new peer."""
-        return self._sequence_matches is not False and self._clock_matches is True
+    def is_same_sender(self) -> bool | None:
+        """True if this is the owner's sender, which has only changed its address; False if not; None if unknown."""
+        return False if self._sequence_matches is False else self._clock_matches
 
-    def has_replaced(self, now: float, rate: float) -> bool:
-        """Return True if the claim proves that the new peer has replaced the owner.
-
-        ``rate`` is the owner's number of frames per second.
-        """
-        # The claim must last for the time in which the owner usually sends three frames. Any frame of the owner ends
-        # the claim.
+    def has_replaced_owner(self, now: float, rate: float) -> bool:
+        """Return True if the sender has moved to this peer. ``rate`` is its number of frames per second."""
+        # In the time in which the sender usually sends three frames, it has sent none from its old address.
         return (
-            self.continues_owner
-            and self._frames >= CLAIM_MIN_FRAMES
-            and (now - self._claimed_at) * rate >= CLAIM_MIN_FRAMES
+            self.is_same_sender is True
+            and self._frames >= MIN_TAKEOVER_FRAMES
+            and (now - self._began_at) * rate >= MIN_TAKEOVER_FRAMES
         )
-
-    @property
-    def may_continue_owner(self) -> bool:
-        """False if the evidence proves that the new peer is not the owner itself."""
-        return self._sequence_matches is not False and self._clock_matches is not False
 
 
 def boot_time_ms(frame: Frame) -> int | None:
@@ -110,7 +94,7 @@ def boot_time_ms(frame: Frame) -> int | None:
 logger: logging.Logger = logging.getLogger("aerokit")
 
 ROUTE_TIMEOUT_S = 3.5
-"""Another peer may claim a component's route after this silence of the component, e.g. because its port has changed."""
+"""Another peer may take over a component's route after this silence of the component, e.g. on a new port."""
 
 PEER_TTL_S = 30.0
 """Time without heartbeats after which a peer may be evicted. A peer with a vehicle object is never evicted."""
@@ -118,8 +102,8 @@ PEER_TTL_S = 30.0
 MAX_ROUTES = 1024
 """Maximum number of components with a route. Messages to other components go to every peer."""
 
-MAX_CLAIMS = 256
-"""Maximum number of remembered claims. An evicted claim is reported again when the peer repeats it."""
+MAX_OTHER_PEERS = 256
+"""Maximum number of remembered `OtherPeer` objects. An evicted one is reported again when it sends again."""
 
 SWEEP_INTERVAL_S = 1.0
 
@@ -147,20 +131,20 @@ class Routes:
     """Routing table: maps each (system id, component id) to the peer that owns the route.
 
     The first peer that sends a HEARTBEAT under these ids owns the route. Frames of other peers under the same ids are
-    dropped (``DuplicateSender``). Another peer continues the owner's stream if its sequence numbers and, where known,
-    its time since boot are those expected of the owner. The owner is gone once it has disconnected, or after 3.5 s
-    without a heartbeat, not counting pauses of the event loop.
+    dropped (``DuplicateSender``). Their sequence numbers and, where known, their time since boot show whether it is the
+    same sender, which has only changed its address. The owner is gone once it has disconnected, or after 3.5 s without
+    a heartbeat, not counting pauses of the event loop.
 
     Another peer takes over the route (``RouteChanged``)
 
-    1. at once, if it is another port of the same host and has continued the stream with three frames, and the owner has
-       sent nothing for as long as it usually needs for three frames;
-    2. when the owner is gone, if the peer is on the same host (as after a reboot), continues the stream, or signs with
+    1. at once, if it is another port of the same host, and the same sender has sent three frames from there and none
+       from its old port;
+    2. when the owner is gone, if the peer is on the same host (as after a reboot), is the same sender, or signs with
        our key;
     3. when the owner is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
 
-    A peer that was refused (``RouteChangeRefused``) is judged anew only after the owner has sent again. The route of a
-    system with a vehicle object never expires.
+    A peer that was refused (``RouteChangeRefused``) is compared again only after the owner has sent again. The route of
+    a system with a vehicle object never expires.
 
     ``attached`` has the system ids with a vehicle object. ``boot_clocks[component](received_at)`` returns the expected
     time since boot of a component in milliseconds. ``publish`` publishes events.
@@ -179,7 +163,7 @@ class Routes:
         self._boot_clocks = {} if boot_clocks is None else boot_clocks
         self._may_move = may_move  # True if a silent system may move to any host
         self._routes: dict[ComponentId, _Route] = {}
-        self._claims: dict[tuple[ComponentId, Peer], RouteClaim] = {}  # by component and claiming peer
+        self._other_peers: dict[tuple[ComponentId, Peer], OtherPeer] = {}
         self._swept_at = 0.0  # time of the last removal of expired routes
 
     def record_heartbeat(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
@@ -231,20 +215,23 @@ class Routes:
         route = self._routes.get((frame.system_id, frame.component_id))
         return route is not None and route.peer != peer
 
-    def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Record the claim of ``peer`` to the sender's route. Return True if the peer now owns the route."""
+    def try_move_route(self, frame: Frame, peer: Peer, *, is_signed: bool) -> bool:
+        """Move the route of the frame's sender to ``peer``, which does not own it, if that is allowed.
+
+        Returns True if the route was moved. ``is_signed`` is True if the frame is signed with our key.
+        """
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
         is_same_host = self._link.host_of(peer) == self._link.host_of(route.peer)
         needs_no_evidence = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
-        claim = self._claim(source, peer)
-        claim.add(frame, self._evidence(route, frame))
-        has_replaced = is_same_host and claim.has_replaced(now, route.rate)
-        if has_replaced or (is_silent and (needs_no_evidence or claim.continues_owner)):
+        other = self._other_peer(source, peer)
+        self._compare(other, route, frame)
+        has_replaced = is_same_host and other.has_replaced_owner(now, route.rate)
+        if has_replaced or (is_silent and (needs_no_evidence or other.is_same_sender)):
             self._move_route(route, frame, peer)
             return True
-        self._report(claim, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
+        self._report(other, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
         return False
 
     def exclude_pause(self, now: float, paused_s: float) -> None:
@@ -255,20 +242,22 @@ class Routes:
 
     def record_duplicate_sender(self, frame: Frame) -> None:
         """Record that two senders behind one peer use the ids of this frame."""
-        claim = self._claim((frame.system_id, frame.component_id), _SAME_PEER)
-        if not claim.is_duplicate_reported:
-            claim.is_duplicate_reported = True
+        other = self._other_peer((frame.system_id, frame.component_id), _SAME_PEER)
+        if not other.is_duplicate_reported:
+            other.is_duplicate_reported = True
             self._publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Drop the claims of an idle peer, and return the peer. None if no peer is idle."""
+        """Forget an idle peer, and return it. None if no peer is idle."""
         live = {
             route.peer
             for (system_id, _), route in self._routes.items()
             if system_id in self._attached or now - route.heartbeat_at <= PEER_TTL_S
         }
         evicted = next((peer for peer in peers if peer not in live), None)
-        self._claims = {(source, peer): claim for (source, peer), claim in self._claims.items() if peer != evicted}
+        self._other_peers = {
+            (source, peer): other for (source, peer), other in self._other_peers.items() if peer != evicted
+        }
         return evicted
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
@@ -276,20 +265,20 @@ class Routes:
         autopilot = system_id, MavComponent.AUTOPILOT1
         return {
             peer
-            for (source, peer), claim in self._claims.items()
-            if source == autopilot and claim.is_duplicate_reported
+            for (source, peer), other in self._other_peers.items()
+            if source == autopilot and other.is_duplicate_reported
         }
 
-    def _claim(self, source: ComponentId, peer: Peer) -> RouteClaim:
+    def _other_peer(self, source: ComponentId, peer: Peer) -> OtherPeer:
         key = source, peer
-        claim = self._claims.get(key)
-        if claim is None:
-            if len(self._claims) >= MAX_CLAIMS:
-                del self._claims[next(iter(self._claims))]  # drop the oldest claim
-            claim = self._claims[key] = RouteClaim()
-        return claim
+        other = self._other_peers.get(key)
+        if other is None:
+            if len(self._other_peers) >= MAX_OTHER_PEERS:
+                del self._other_peers[next(iter(self._other_peers))]  # the oldest one
+            other = self._other_peers[key] = OtherPeer()
+        return other
 
-    def _evidence(self, route: _Route, frame: Frame) -> Evidence:
+    def _compare(self, other: OtherPeer, route: _Route, frame: Frame) -> None:
         sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0
@@ -306,12 +295,12 @@ class Routes:
         clock_matches: bool | None = None
         if expected_ms is None:
             # The unknown clock of the owner counts as matching, so that the sequence numbers alone decide. If they are
-            # unknown, too, nothing is proven.
+            # unknown, too, the result is unknown.
             clock_matches = None if sequence_matches is None else True
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
             clock_matches = abs(boot_ms - expected_ms) <= tolerance_ms
-        return Evidence(expected, sequence_matches, clock_matches)
+        other.add(frame, expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         before, route.peer = route.peer, peer
@@ -319,20 +308,20 @@ class Routes:
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        # All claims to the route refer to its old owner.
-        self._claims = {
-            (claimed, claimer): claim for (claimed, claimer), claim in self._claims.items() if claimed != source
+        # The others were compared with the old owner.
+        self._other_peers = {
+            (component, peer): other for (component, peer), other in self._other_peers.items() if component != source
         }
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
-    def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
+    def _report(self, other: OtherPeer, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
         source = frame.system_id, frame.component_id
-        may_be_owner = is_same_host and claim.may_continue_owner  # The owner may just have changed its port.
-        if not claim.is_duplicate_reported and not may_be_owner:
-            claim.is_duplicate_reported = True
+        may_be_same = is_same_host and other.is_same_sender is not False  # The sender may just have changed its port.
+        if not other.is_duplicate_reported and not may_be_same:
+            other.is_duplicate_reported = True
             self._publish(DuplicateSender(frame.received_at, *source))
-        if is_silent and not claim.may_continue_owner and not claim.is_refusal_reported:
-            claim.is_refusal_reported = True
+        if is_silent and other.is_same_sender is False and not other.is_refusal_reported:
+            other.is_refusal_reported = True
             logger.warning(
                 "%d/%d is silent; frames from %s under the same ids are refused, because they do not continue its"
                 " stream (may_move=True accepts them)",
@@ -353,7 +342,7 @@ class Routes:
         return len(self._routes) < MAX_ROUTES
 
 
-_SAME_PEER = object()  # used as the peer in claims of a second sender that is received from the owner's peer
+_SAME_PEER = object()  # key in `_other_peers` of a second sender that is received from the owner's peer
 
 
 def _peer_name(peer: Peer) -> str:

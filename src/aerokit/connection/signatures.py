@@ -1,4 +1,4 @@
-"""``SignatureGate``: signs the frames of a connection and refuses received frames without a valid signature."""
+"""``SignatureFilter``: signs the frames of a connection and refuses received frames without a valid signature."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MIN_UNSIGNED_FRAMES = 3
 MIN_UNSIGNED_S = 2.0
 
 
-class SignatureGate:
+class SignatureFilter:
     """Admits the frames that the encoder's ``signing`` accepts, or all frames while that is None.
 
     The first refusal for each reason is logged and published as an event. ``unix_time`` returns seconds since 1970.
@@ -43,10 +43,10 @@ class SignatureGate:
         self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # last logged error of writing the file of ``Signing(keep=…)``
         # The owner calls `set_signing`, which sets the actual value, before the first frame.
-        self.is_open: bool = True
-        """True while all frames are admitted without a check."""
+        self.admits_all: bool = True
+        """True while no frame needs a check."""
         self.on_change: Callable[[], object] = lambda: None
-        """Called when :attr:`is_open` may have changed."""
+        """Called when :attr:`admits_all` may have changed."""
 
     def set_signing(self, signing: Signing | None) -> None:
         """Sign and verify with this key from now on (None: neither). Raises InvalidArgument with MAVLink 1."""
@@ -81,7 +81,7 @@ class SignatureGate:
             self._update()
 
     def _update(self) -> None:
-        self.is_open = self._encoder.signing is None and self._handover is None
+        self.admits_all = self._encoder.signing is None and self._handover is None
         self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
@@ -91,7 +91,7 @@ class SignatureGate:
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
-        if handover is not None and is_of_handover and handover.is_completed_by(frame, self._unix_time()):
+        if handover is not None and is_of_handover and handover.receive(frame, self._unix_time()):
             self._handover = None
             self.set_signing(handover.signing)
             handover.switched.set()
@@ -167,7 +167,7 @@ class _Handover:
     def concerns(self, frame: Frame) -> bool:
         return (frame.system_id, frame.component_id) == self._source
 
-    def is_completed_by(self, frame: Frame, unix_time_s: float) -> bool:
+    def receive(self, frame: Frame, unix_time_s: float) -> bool:
         """Process a frame of the component. Return True if it proves the change of the key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)

@@ -130,11 +130,11 @@ class Cancellation:
         return bool(self._scope.__exit__(exc_type, exc, traceback))
 
 
-Alarm = Callable[[], None]
+Callback = Callable[[], None]
 
 
 class Deadlines:
-    """Calls each alarm (a function) at its deadline, unless the deadline is cancelled before.
+    """Calls each callback at its deadline, unless the deadline is cancelled before.
 
     Most deadlines of requests are cancelled soon, when the answer arrives. One timer serves all deadlines, because a
     loop timer for each would cost more than sending the request. Cancelling a deadline does not reschedule the timer.
@@ -142,17 +142,17 @@ class Deadlines:
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
-        self._deadlines: dict[Alarm, float] = {}  # loop time at which each alarm is called
+        self._deadlines: dict[Callback, float] = {}  # loop time at which each callback is called
         self._timer: asyncio.TimerHandle | None = None  # None while there is no deadline
         self._timer_at = 0.0  # Stored here, because uvloop's TimerHandle does not return a time in the past.
 
-    def set(self, alarm: Alarm, at: float) -> None:
-        """Call ``alarm`` at the loop time ``at``, in seconds. This replaces an earlier deadline of the same alarm."""
-        self._deadlines[alarm] = at
+    def set(self, callback: Callback, at: float) -> None:
+        """Call ``callback`` at the loop time ``at``, in seconds. This replaces its earlier deadline."""
+        self._deadlines[callback] = at
         self._schedule(at)
 
-    def cancel(self, alarm: Alarm) -> None:
-        self._deadlines.pop(alarm, None)
+    def cancel(self, callback: Callback) -> None:
+        self._deadlines.pop(callback, None)
 
     def close(self) -> None:
         self._deadlines.clear()
@@ -164,12 +164,12 @@ class Deadlines:
         self._timer = None
         try:
             # The clock is not read, because a loop may fire a timer slightly early.
-            for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
-                # Another alarm of this list may have cancelled this one, or set it to a later time.
-                if self._deadlines.get(alarm, math.inf) <= timer_at:
-                    del self._deadlines[alarm]
-                    alarm()
-        finally:  # If an alarm raises, the loop logs the exception, and the others are called by the next timer.
+            for callback in [callback for callback, at in self._deadlines.items() if at <= timer_at]:
+                # Another callback of this list may have cancelled this one, or set it to a later time.
+                if self._deadlines.get(callback, math.inf) <= timer_at:
+                    del self._deadlines[callback]
+                    callback()
+        finally:  # If a callback raises, the loop logs the exception, and the others are called by the next timer.
             if self._deadlines:
                 self._schedule(min(self._deadlines.values()))
 

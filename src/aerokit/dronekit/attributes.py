@@ -26,7 +26,8 @@ from aerokit.dronekit.values import (
     Wind,
 )
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import EkfStatusFlags, MavProtocolCapability
+from aerokit.mavlink.enums import EkfStatusFlags as EkfFlags
+from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
@@ -34,12 +35,6 @@ if TYPE_CHECKING:
 
 # Names of MAV_STATE by value.
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
-# Flags of EKF_STATUS_REPORT. ESTIMATOR_STATUS has the same flags.
-POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
-    EkfStatusFlags.POS_HORIZ_ABS.value,
-    EkfStatusFlags.CONST_POS_MODE.value,
-    EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
-)
 FACING_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
 NO_MODE = (None, "INITIALISING", "MAV")  # mode names while the vehicle boots and has no flight mode yet
 GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")
@@ -89,18 +84,18 @@ class Locations(HasObservers, LocationPrivates):
 
     def _on_global_position(self, message: m.GlobalPositionInt) -> None:
         self._has_altitude = self._has_altitude or message.alt != 0
-        self._announce("global_relative_frame")
+        self._notify_frame("global_relative_frame")
         if self._has_altitude:
-            self._announce("global_frame")
-        self._core.listeners.announce("location")
+            self._notify_frame("global_frame")
+        self._core.listeners.notify_attribute("location")
 
     def _on_local_position(self, _: m.LocalPositionNed) -> None:
-        self._announce("local_frame")
-        self._core.listeners.announce("location")
+        self._notify_frame("local_frame")
+        self._core.listeners.notify_attribute("location")
 
-    def _announce(self, frame: str) -> None:
-        self._dk_listeners.announce(frame)
-        self._core.listeners.announce(f"location.{frame}")
+    def _notify_frame(self, frame: str) -> None:
+        self._dk_listeners.notify_attribute(frame)
+        self._core.listeners.notify_attribute(f"location.{frame}")
 
 
 def _position_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]:
@@ -132,15 +127,15 @@ class VehicleAttributes(VehicleCore):
         super().__init__(handler)
         core = self._dk
         self._location = Locations(self)
-        # Core.on() and Core.announce() return a `LatestMessage`.
+        # Core.on() and Core.notify_on() return a `LatestMessage`.
         core.on(m.Heartbeat, self._dk_on_heartbeat)
-        self._dk_position = core.announce(m.GlobalPositionInt, "velocity")
-        self._dk_vfr_hud = core.announce(m.VfrHud, "heading", "airspeed", "groundspeed")
-        self._dk_attitude = core.announce(m.Attitude, "attitude")
-        self._dk_sys_status = core.announce(m.SysStatus, "battery")
-        self._dk_gps = core.announce(m.GpsRawInt, "gps_0")
-        self._dk_wind = core.announce(m.Wind, "wind")
-        self._dk_rangefinder = core.announce(m.Rangefinder, "rangefinder")
+        self._dk_position = core.notify_on(m.GlobalPositionInt, "velocity")
+        self._dk_vfr_hud = core.notify_on(m.VfrHud, "heading", "airspeed", "groundspeed")
+        self._dk_attitude = core.notify_on(m.Attitude, "attitude")
+        self._dk_sys_status = core.notify_on(m.SysStatus, "battery")
+        self._dk_gps = core.notify_on(m.GpsRawInt, "gps_0")
+        self._dk_wind = core.notify_on(m.Wind, "wind")
+        self._dk_rangefinder = core.notify_on(m.Rangefinder, "rangefinder")
         core.on(m.DistanceSensor, self._dk_on_distance_sensor)
         core.on(m.EkfStatusReport, self._dk_on_ekf_status)
         core.on(m.EstimatorStatus, self._dk_on_ekf_status)
@@ -232,7 +227,7 @@ class VehicleAttributes(VehicleCore):
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         # Like DroneKit, require any fix (2D or better) and a predicted position of the estimator.
         gps = self._dk_gps.message
-        return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
+        return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & EkfFlags.PRED_POS_HORIZ_ABS)
 
     @property
     def version(self) -> Version:
@@ -272,15 +267,14 @@ class VehicleAttributes(VehicleCore):
         has_rangefinder_message = self._dk_rangefinder.message is not None  # RANGEFINDER takes precedence.
         if message.orientation == FACING_DOWN and not has_rangefinder_message:
             self._dk_distance_down = message.current_distance / 100.0
-            self._dk.listeners.announce("rangefinder")
+            self._dk.listeners.notify_attribute("rangefinder")
 
     def _dk_on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
-        flags = message.flags
-        self._dk_ekf_flags = flags
+        flags = self._dk_ekf_flags = message.flags  # ESTIMATOR_STATUS has the same flags as EKF_STATUS_REPORT.
         if self._armed:
-            self._dk_ekf_ok = bool(flags & POS_HORIZ_ABS) and not flags & CONST_POS_MODE
+            self._dk_ekf_ok = bool(flags & EkfFlags.POS_HORIZ_ABS) and not flags & EkfFlags.CONST_POS_MODE
         else:
-            self._dk_ekf_ok = bool(flags & (POS_HORIZ_ABS | PRED_POS_HORIZ_ABS))
+            self._dk_ekf_ok = bool(flags & (EkfFlags.POS_HORIZ_ABS | EkfFlags.PRED_POS_HORIZ_ABS))
         self._dk.listeners.notify("ekf_ok", self._dk_ekf_ok, cache=True)
 
     def _dk_on_home(self, message: m.HomePosition) -> None:

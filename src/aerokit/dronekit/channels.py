@@ -8,7 +8,7 @@ from collections.abc import ItemsView, Iterable, KeysView, Mapping, ValuesView
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from aerokit.dronekit.classic_connection import RELEASE_UPPER
+from aerokit.dronekit.classic_connection import MAVLINK_1_CHANNELS, MAX_CHANNELS, RELEASE_UPPER
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.privates import Python2Mapping
@@ -18,9 +18,7 @@ from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsR
 if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
 
-MIN_CHANNELS, MAX_CHANNELS = 8, 18
-# MAVLink 2 adds channels above this number to RC_CHANNELS_OVERRIDE. Another value releases them.
-MAVLINK_1_CHANNELS = 8
+MIN_CHANNELS = 8
 MAX_MICROSECONDS = 0xFFFF
 UNUSED = 0xFFFF  # The channel does not exist (RC_CHANNELS), or stays unchanged (RC_CHANNELS_OVERRIDE).
 NUMBERS = tuple(str(number) for number in range(1, MAX_CHANNELS + 1))

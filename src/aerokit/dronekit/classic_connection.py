@@ -60,7 +60,7 @@ class ClassicConnection:
         self.overrides = overrides
         self.supports_mavlink_2 = False
         """True once the vehicle has reported that it supports MAVLink 2, even if it still sends version 1."""
-        self.note_sent: Callable[[Message], None] = lambda message: None
+        self.on_sent: Callable[[Message], None] = lambda message: None
         """Called on the loop with each sent message, because a message may overrule earlier orders."""
         self.vehicle: Any = None
         """The vehicle on this connection; None before it is connected."""
@@ -88,8 +88,8 @@ class ClassicConnection:
     def _send(self, message: Message, to: int | None) -> None:
         try:
             self.connection.send(message, to=to)
-            self.overrides.note_sent(message)
-            self.note_sent(message)
+            self.overrides.record(message)
+            self.on_sent(message)
         except AerokitError as error:
             logger.warning("%s was not sent: %s", message.NAME, error)
 
@@ -275,8 +275,8 @@ IGNORE = 0xFFFF
 RELEASE = 0
 RELEASE_UPPER = 0xFFFE  # releases a channel above 8; 0 leaves such a channel unchanged
 
-CHANNELS_OF_MAVLINK_1 = 8
-CHANNELS = 18
+MAVLINK_1_CHANNELS = 8  # MAVLink 2 adds channels above this number to RC_CHANNELS_OVERRIDE.
+MAX_CHANNELS = 18
 
 RELEASE_COPIES = 3  # The message is not acknowledged, and a frame may be lost.
 
@@ -293,16 +293,15 @@ class OverrideRelease:
         self.is_enabled = True
         self._overridden: dict[tuple[int, int], set[int]] = {}  # (system id, component id) → channels
 
-    def note_sent(self, message: Message) -> None:
+    def record(self, message: Message) -> None:
         """Record which channels a sent RC_CHANNELS_OVERRIDE overrides or releases."""
         if not isinstance(message, RcChannelsOverride):
             return
         target = message.target_system, message.target_component
         overridden = self._overridden.setdefault(target, set())
-        for channel in range(1, CHANNELS + 1):
+        for channel in range(1, MAX_CHANNELS + 1):
             value = getattr(message, f"chan{channel}_raw")
-            is_upper = channel > CHANNELS_OF_MAVLINK_1
-            if value == (RELEASE_UPPER if is_upper else RELEASE):
+            if value == (RELEASE_UPPER if channel > MAVLINK_1_CHANNELS else RELEASE):
                 overridden.discard(channel)
             elif value not in (IGNORE, RELEASE):  # RELEASE leaves the channels above 8 unchanged.
                 overridden.add(channel)
@@ -310,7 +309,7 @@ class OverrideRelease:
     def send(self, connection: Connection) -> None:
         for (system, component), channels in self._overridden.items():
             if self.is_enabled and channels:
-                values = [_release_value(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
+                values = [_release_value(channel, channel in channels) for channel in range(1, MAX_CHANNELS + 1)]
                 message = RcChannelsOverride(system, component, *values)
                 with contextlib.suppress(AerokitError):  # The link may already be closed.
                     for _ in range(RELEASE_COPIES):
@@ -318,6 +317,6 @@ class OverrideRelease:
 
 
 def _release_value(channel: int, is_overridden: bool) -> int:
-    if channel > CHANNELS_OF_MAVLINK_1:
+    if channel > MAVLINK_1_CHANNELS:
         return RELEASE_UPPER if is_overridden else 0
     return RELEASE if is_overridden else IGNORE

@@ -101,7 +101,7 @@ class LatestMessage(Generic[MessageT]):
         self._listeners = [listeners]
         # Attributes whose listeners the handlers notify; empty if the handlers do more than that. A message for which
         # these attributes have no listeners is decoded later.
-        self._announced_names: set[str] = set()
+        self._notified_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
         self._decoded: MessageT | None = None  # cache of the property `message`; may be older than `_latest`
@@ -125,7 +125,7 @@ class LatestMessage(Generic[MessageT]):
 
     def add(self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None) -> None:
         self._handlers.append(handler)
-        self._announced_names.update(names)
+        self._notified_names.update(names)
         if listeners is not None:
             self._listeners.append(listeners)
 
@@ -145,7 +145,7 @@ class LatestMessage(Generic[MessageT]):
 
     def _must_decode(self) -> bool:
         """Return True if a handler needs the message now."""
-        names = self._announced_names
+        names = self._notified_names
         # Without names, the handlers need each message. With names, they need it until all attributes have a value.
         if not names or not names <= self._ready_names:
             return True
@@ -230,14 +230,14 @@ class Core:
         latest.add(handler, names, listeners)
         return latest
 
-    def announce(self, message_type: type[MessageT], *names: str) -> LatestMessage[MessageT]:
+    def notify_on(self, message_type: type[MessageT], *names: str) -> LatestMessage[MessageT]:
         """Like :meth:`on`, with a handler that notifies the listeners of the attributes ``names``."""
 
-        def announce(_: MessageT) -> None:
+        def notify(_: MessageT) -> None:
             for name in names:
-                self.listeners.announce(name)
+                self.listeners.notify_attribute(name)
 
-        return self.on(message_type, announce, *names)
+        return self.on(message_type, notify, *names)
 
     def start_receiving(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving on the loop thread, once the vehicle is connected."""

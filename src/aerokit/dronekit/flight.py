@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from concurrent.futures import Future
 
+    from aerokit.autopilots.modes import Mode
     from aerokit.dronekit.classic_connection import BackgroundCall
 
 HOME_TIMEOUT_S = 10.0
@@ -55,22 +56,24 @@ class FlightMethods(VehicleAttributes):
 
     @mode.setter
     def mode(self, value: VehicleMode | str | int) -> None:
-        self._dk_set_mode(value)
+        self._dk_set_mode(self._dk_find_mode(value))
 
-    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, BackgroundCall]:
-        aio = self._dk.check_link()
-        mode = flight_orders.find_mode(aio, value.name if isinstance(value, VehicleMode) else value)
-        return mode.name, self._dk.order("mode", flight_orders.change_mode, aio, mode)
+    def _dk_find_mode(self, value: VehicleMode | str | int) -> Mode:
+        return flight_orders.find_mode(self._dk.check_link(), value.name if isinstance(value, VehicleMode) else value)
+
+    def _dk_set_mode(self, mode: Mode) -> BackgroundCall:
+        return self._dk.order("mode", flight_orders.change_mode, self._dk.aio, mode)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until HEARTBEAT confirms it.
 
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects the mode.
         """
-        name, order = self._dk_set_mode(mode)
+        found = self._dk_find_mode(mode)
+        order = self._dk_set_mode(found)
 
         def is_done() -> bool:
-            return self._flightmode == name and not self._dk_is_heartbeat_old
+            return self._flightmode == found.name and not self._dk_is_heartbeat_old
 
         self._dk_wait_for_order(order, is_done, timeout, "failed to set flight mode")
 
@@ -207,25 +210,22 @@ class FlightMethods(VehicleAttributes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
             return  # The speeds are not sent either, because they would change the flight of the present mode.
-        self._dk.order("goto", flight_orders.go_to, aio, *target)
+        self._dk.order("goto", flight_orders.go_to, aio, target)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
             self.groundspeed = groundspeed
 
-    def _dk_target(self, location: object, *, is_relative: bool) -> tuple[int, int, float]:
-        """Convert a location to latitude and longitude in 1e-7 degrees and an altitude in metres.
-
-        The altitude is above home with ``is_relative``, otherwise above sea level.
-        """
+    def _dk_target(self, location: object, *, is_relative: bool) -> flight_orders.Target:
+        """Convert a location. The altitude is above home with ``is_relative``, otherwise above sea level."""
         if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
-        latitude, longitude, altitude = flight_orders.checked_location(location)
+        target = flight_orders.checked_location(location)
         if is_relative and isinstance(location, LocationGlobal):
-            altitude -= self._dk_home_altitude()
-        elif not is_relative and not isinstance(location, LocationGlobal):
-            altitude += self._dk_home_altitude()
-        return latitude, longitude, altitude
+            return target._replace(altitude_m=target.altitude_m - self._dk_home_altitude())
+        if not is_relative and not isinstance(location, LocationGlobal):
+            return target._replace(altitude_m=target.altitude_m + self._dk_home_altitude())
+        return target
 
     # -------------------------------------------------------------------------------- speeds
 
@@ -271,11 +271,11 @@ class FlightMethods(VehicleAttributes):
     def home_location(self, pos: LocationGlobal) -> None:
         if not isinstance(pos, LocationGlobal):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
-        latitude, longitude, altitude = flight_orders.checked_location(pos)
+        target = flight_orders.checked_location(pos)
         aio = self._dk.check_link()
-        home = {"frame": MavFrame.GLOBAL, "x": latitude, "y": longitude, "z": altitude}
+        home = {"frame": MavFrame.GLOBAL, "x": target.latitude_e7, "y": target.longitude_e7, "z": target.altitude_m}
         order = self._dk.order("home", aio.command_int, MavCmd.DO_SET_HOME, 0, **home, component_id=0, or_long=True)
-        self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
+        self._home_location = LocationGlobal(pos.lat, pos.lon, target.altitude_m)
         order.add_done_callback(functools.partial(self._dk_on_home_answer, self._home_location))
 
     def _dk_on_home_answer(self, new: LocationGlobal, order: Future[None]) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import anyio
 
@@ -126,11 +126,18 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
         await order.command(command, *params, component_id=0)
 
 
-async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
+class Target(NamedTuple):
+    """Latitude and longitude in degrees times 1e7, and an altitude in metres."""
+
+    latitude_e7: int
+    longitude_e7: int
+    altitude_m: float
+
+
+async def go_to(vehicle: AsyncVehicle, target: Target) -> None:
     """Send DO_REPOSITION or, if it is unsupported, SET_POSITION_TARGET_GLOBAL_INT.
 
-    Latitude and longitude are in 1e-7 degrees. The altitude is in metres, above sea level on PX4, otherwise above
-    home.
+    The altitude is above sea level on PX4, otherwise above home.
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     flags = MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0
@@ -143,9 +150,9 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
                 0,  # default radius
                 math.nan,  # unchanged yaw
                 frame=MavFrame.GLOBAL_INT if is_amsl else MavFrame.GLOBAL_RELATIVE_ALT_INT,
-                x=latitude,
-                y=longitude,
-                z=altitude,
+                x=target.latitude_e7,
+                y=target.longitude_e7,
+                z=target.altitude_m,
                 component_id=0,
             )
         except CommandRejected as error:
@@ -158,7 +165,7 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             set_point = m.SetPositionTargetGlobalInt(
                 time_boot_ms=0, target_system=vehicle.system_id, target_component=0,
                 coordinate_frame=MavFrame.GLOBAL_RELATIVE_ALT_INT, type_mask=POSITION_ONLY,
-                lat_int=latitude, lon_int=longitude, alt=altitude,
+                lat_int=target.latitude_e7, lon_int=target.longitude_e7, alt=target.altitude_m,
                 vx=0.0, vy=0.0, vz=0.0, afx=0.0, afy=0.0, afz=0.0, yaw=0.0, yaw_rate=0.0,
             )  # fmt: skip
             vehicle.send(set_point)
@@ -180,8 +187,7 @@ async def reject(reason: str) -> None:
     raise APIException(reason)
 
 
-def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Return latitude and longitude in 1e-7 degrees, and the altitude in metres."""
+def checked_location(location: LocationGlobal | LocationGlobalRelative) -> Target:
     for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", MAX_FLOAT)):
         value = getattr(location, name)
         try:
@@ -191,7 +197,7 @@ def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple
         if not is_good:
             allowed = "a finite number" if limit == MAX_FLOAT else f"-{limit:g} to {limit:g} degrees"
             raise InvalidArgument(f"location.{name} = {value!r} is not allowed: it must be {allowed}")
-    return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
+    return Target(round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt))
 
 
 def check_speed(name: str, speed: float | None) -> None:
@@ -267,7 +273,7 @@ CALIBRATION_TIMEOUT_S = 35.0
 
 REBOOT_TIMEOUT_S = 3.0
 
-TUNE_SIZES = (30, 200)  # characters in the fields `tune` and `tune2` of PLAY_TUNE
+TUNE_SIZE, TUNE2_SIZE = 30, 200  # characters in the fields `tune` and `tune2` of PLAY_TUNE
 
 
 class Maintenance(VehicleCore):
@@ -320,8 +326,7 @@ class Maintenance(VehicleCore):
         text = _tune_text(tune)
         if self._dk.check_link().connection.mavlink_version == 1:
             raise APIException("play_tune needs MAVLink 2, and this vehicle uses MAVLink 1")
-        first_size, _ = TUNE_SIZES
-        self._dk.send(PlayTune(self._dk.target_system, 0, text[:first_size], text[first_size:]))
+        self._dk.send(PlayTune(self._dk.target_system, 0, text[:TUNE_SIZE], text[TUNE_SIZE:]))
 
     def reboot(self) -> None:
         """Reboot the autopilot, which then does not answer for some seconds. An armed vehicle refuses.
@@ -347,8 +352,9 @@ def _tune_text(tune: str | bytes) -> str:
         text = data.rstrip(b"\0").decode("ascii")
     except (UnicodeError, AttributeError):
         raise InvalidArgument(f"tune = {tune!r} is not allowed: it must be ASCII text") from None
-    if "\0" in text or len(text) > sum(TUNE_SIZES):
+    max_size = TUNE_SIZE + TUNE2_SIZE
+    if "\0" in text or len(text) > max_size:
         raise InvalidArgument(
-            f"tune of {len(text)} characters is not allowed: at most {sum(TUNE_SIZES)} characters, none of them NUL"
+            f"tune of {len(text)} characters is not allowed: at most {max_size} characters, none of them NUL"
         )
     return text

@@ -60,8 +60,8 @@ class Master:
     @property
     def target_component(self) -> int:
         """Component id of the vehicle's autopilot; 0 until the vehicle is found."""
-        component_id, _ = self._autopilot()
-        return component_id
+        heartbeat = self._heartbeat
+        return 0 if heartbeat is None or heartbeat.received_frame is None else heartbeat.received_frame.component_id
 
     @property
     def address(self) -> str:
@@ -75,7 +75,7 @@ class Master:
     @property
     def flightmode(self) -> str:
         """Name of the flight mode; ``UNKNOWN`` before the first HEARTBEAT."""
-        _, heartbeat = self._autopilot()
+        heartbeat = self._heartbeat
         if heartbeat is None or heartbeat.received_frame is None:
             return "UNKNOWN"
         return str(mavutil.mode_string_v10(message_of(heartbeat.received_frame)))
@@ -87,7 +87,7 @@ class Master:
 
     def mode_mapping(self) -> dict[str, Any] | None:
         """Return a dict of mode names to numbers (PX4: to three numbers), or None if the modes are unknown."""
-        _, heartbeat = self._autopilot()
+        heartbeat = self._heartbeat
         if heartbeat is None:
             return None
         if heartbeat.autopilot == MavAutopilot.PX4:
@@ -100,7 +100,7 @@ class Master:
 
         On PX4, a mode has three numbers: those that :meth:`mode_mapping` returns for its name.
         """
-        _, heartbeat = self._autopilot()
+        heartbeat = self._heartbeat
         is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle
         # Vehicle.mode accepts names and ArduPilot's numbers, but not PX4's three numbers.
@@ -129,7 +129,7 @@ class Master:
         self._command(MavCmd.COMPONENT_ARM_DISARM, 0)
 
     def motors_armed(self) -> bool:
-        _, heartbeat = self._autopilot()
+        heartbeat = self._heartbeat
         return heartbeat is not None and is_armed(heartbeat.base_mode)
 
     def motors_armed_wait(self) -> None:
@@ -244,12 +244,13 @@ class Master:
         target = self._connection.target_system
         self._connection.send(from_pymavlink(message, target), to=target or None)
 
-    def _autopilot(self) -> tuple[int, Heartbeat | None]:
-        """Return component id and last HEARTBEAT of the vehicle's autopilot; 0 and None if there was none."""
-        for (system_id, component_id), heartbeat in self._connection.connection.heartbeats.copy().items():
+    @property
+    def _heartbeat(self) -> Heartbeat | None:
+        """The last HEARTBEAT of the vehicle's autopilot."""
+        for (system_id, _), heartbeat in self._connection.connection.heartbeats.copy().items():
             if system_id == self.target_system and is_autopilot(heartbeat):
-                return component_id, heartbeat
-        return 0, None
+                return heartbeat
+        return None
 
 
 class Inbox(Mapping[str, Any]):

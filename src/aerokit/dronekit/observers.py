@@ -99,7 +99,7 @@ class Listeners:
         else:
             self._thread.post_or_drop(self.deliver, name, value)
 
-    def announce(self, name: str) -> None:
+    def notify_attribute(self, name: str) -> None:
         """Call the listeners with the value of the owner's attribute, which is not read without listeners."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))

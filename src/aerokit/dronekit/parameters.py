@@ -357,15 +357,15 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        is_settled = self._is_settled  # Read it before `find`, because the last value may arrive in between.
+        has_all = self._has_all_values  # Read it before `find`, because the last value may arrive in between.
         resolved = self._values.find(name)
-        if resolved is None and waits and not is_settled and _is_valid_name(name):
+        if resolved is None and waits and not has_all and _is_valid_name(name):
             self._core.run(self._wait_for, name)
             resolved = self._values.find(name)
         return resolved
 
     @property
-    def _is_settled(self) -> bool:
+    def _has_all_values(self) -> bool:
         return self._download.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:

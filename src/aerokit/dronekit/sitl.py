@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # Maps the vehicle names of dronekit-sitl to the simulator's names.
 KINDS = {"copter": "copter", "solo": "copter", "plane": "plane", "rover": "rover", "sub": "sub"}
 START_TIMEOUT_S = 30.0
-USUAL_ADDRESSES = ("tcpin:127.0.0.1:5760", "udpout:127.0.0.1:14550")
+TCP_ADDRESS, UDP_ADDRESS = "tcpin:127.0.0.1:5760", "udpout:127.0.0.1:14550"
 
 _next_instance = 0  # instance number of the next SITL object that is created without one
 _vehicle_for_program: ServedVehicle | None = None  # the vehicle that --sim has started before the program
@@ -108,11 +108,10 @@ def serve_for_program(kind: str, home: tuple[float, float, float], speedup: floa
     """
     global _vehicle_for_program
     try:
-        _vehicle_for_program = ServedVehicle(kind, USUAL_ADDRESSES, home=home, speedup=speedup)
+        _vehicle_for_program = ServedVehicle(kind, (TCP_ADDRESS, UDP_ADDRESS), home=home, speedup=speedup)
     except LinkOpenError as error:
         errprinter(f"{error}; using another port")
-        _, udp_address = USUAL_ADDRESSES
-        addresses = ("tcpin:127.0.0.1:0", udp_address)  # The system chooses the TCP port.
+        addresses = ("tcpin:127.0.0.1:0", UDP_ADDRESS)  # The system chooses the TCP port.
         _vehicle_for_program = ServedVehicle(kind, addresses, home=home, speedup=speedup)
     return _vehicle_for_program
 
@@ -169,8 +168,7 @@ class SITL:
         if _vehicle_for_program is not None:
             kind = kind or _vehicle_for_program.kind
             speedup = speedup or _vehicle_for_program.speedup
-            _, udp_address = USUAL_ADDRESSES
-            addresses.append(udp_address)
+            addresses.append(UDP_ADDRESS)
             _vehicle_for_program.stop()
             _vehicle_for_program = None
         home = parse_home(options.home) if options.home else HOME

@@ -264,7 +264,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         core = self._dk
         core.start_receiving(aio, tasks)
         self._handler.vehicle = self
-        self._handler.note_sent = aio.note_sent
+        self._handler.on_sent = aio.note_sent
         self._handler.calls.describe = self._dk_describe
         # The event loop keeps these callbacks, so weak references let the vehicle be garbage collected. `_handler` may
         # have strong ones, because it belongs to this vehicle.

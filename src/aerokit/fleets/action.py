@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import enum
 import math
 from collections.abc import Awaitable, Callable, Mapping
 from fnmatch import fnmatchcase
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import anyio
 
@@ -28,7 +29,7 @@ from aerokit.fleets.policy import FleetResult, MemberFailure
 from aerokit.vehicle.commanding.arbiter import STEERING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.connection.connection import Connection
     from aerokit.fleets.events import FleetEvent
@@ -46,6 +47,39 @@ START_TOLERANCE_S = 0.001
 """By how much the delay between the starts of two members may be shorter than ``stagger_s``."""
 
 
+class ActionKind(enum.Enum):
+    """Effect of an action on the flight of its members."""
+
+    ENDS_FLIGHT = enum.auto()
+    """Makes the flight safer (hold, land, return): a member's failure does not stop the others."""
+    MOVES = enum.auto()
+    """Overrules older actions, as ENDS_FLIGHT does: they no longer start its members or send them orders."""
+    ARMS = enum.auto()
+    """Only arms. Of the newer actions, only those that end the flight keep its members from starting."""
+    ON_GROUND = enum.auto()
+    """Does not move members, so they do not hold if the action is cancelled. ARMS and ENDS_FLIGHT do not either."""
+    OTHER = enum.auto()
+    """Any other action, for example a function of the program."""
+
+
+KINDS = {
+    **dict.fromkeys(("hold", "land", "return_to_launch", "disarm", "mission.pause"), ActionKind.ENDS_FLIGHT),
+    **dict.fromkeys(("take_off", "go_to", "form", "show", "set_mode", "set_heading"), ActionKind.MOVES),
+    **dict.fromkeys(("orbit", "loiter", "figure_eight", "land_on"), ActionKind.MOVES),
+    **dict.fromkeys(("mission.start", "mission.resume"), ActionKind.MOVES),
+    **dict.fromkeys(("wait_ready", "upload"), ActionKind.ON_GROUND),
+    "arm": ActionKind.ARMS,
+}
+"""Kinds of the built-in actions by name; all others are OTHER."""
+
+
+class _SentOrders(NamedTuple):
+    """Orders that this program has sent to a member until some time."""
+
+    newest: Order | None  # the newest order that moves the vehicle
+    command_count: int  # number of commands to disarm; for an action that arms, to arm
+
+
 class FleetAction:
     """One run of an action.
 
@@ -56,11 +90,8 @@ class FleetAction:
         execute: coroutine function that is called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
-        is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
-        holds_if_cancelled: members that have already finished the action are told to hold if the action is cancelled,
-            or if a function of the program raises an error.
-        moves_members: older actions must no longer start the members of this action, or send them orders of a policy.
-        arms: the action only arms. Of the newer actions, only those that end the flight keep its members from starting.
+        kind: effect on the flight. If an action of the kinds MOVES and OTHER is cancelled, or a function of the program
+            raises an error, members that have already finished the action are told to hold.
         corridors: the delay of each member, and how late it may start.
     """
 
@@ -73,23 +104,21 @@ class FleetAction:
         *,
         timeout: float | None = None,
         stagger_s: float | None = None,
-        is_safe: bool = False,
-        holds_if_cancelled: bool = True,
-        moves_members: bool = False,
-        arms: bool = False,
+        kind: ActionKind = ActionKind.OTHER,
         corridors: Deconfliction | None = None,
     ) -> None:
         self.name: str = name
         self._context, self._execute, self._timeout = context, execute, timeout
         self._stagger_s = stagger_s or 0.0
-        self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
-        self._moves_members, self._arms, self._corridors = moves_members, arms, corridors
+        self._kind, self._corridors = kind, corridors
+        self._moves_members = kind in (ActionKind.ENDS_FLIGHT, ActionKind.MOVES)
         self._newer_actions: list[FleetAction] = []  # newer actions that move members
         requested = list(members)
         for member in requested:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
-        self._newer_order_checks = {member.name: self._newer_order_check(member) for member in self._members}
+        # The orders before this action, without members that another action has started since.
+        self._orders_before = {member.name: self._orders_of(member) for member in self._members}
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
@@ -98,17 +127,16 @@ class FleetAction:
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._policy_orders: dict[str, PolicyOrder] = {}
-        # System id and name of the failed member for which the policy was applied; None if it was not applied.
-        self._policy_trigger: tuple[int, str] | None = None
+        self._policy_cause: Member | None = None  # the failed member for which the policy was applied
         self._policy_order_errors: dict[str, str] = {}
         self._pending_policy_orders = 0  # number of policy orders that have not ended
         self._last_start_at = -math.inf  # when the last member started
-        self._undecided: list[tuple[Member, Exception]] = []  # failures about which the policy is still to be asked
+        self._undecided: list[Member] = []  # failed members about which the policy is still to be asked
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
         # The order of creation, not of `run`, decides which action is newer.
-        if moves_members:
+        if self._moves_members:
             for action in context.actions:
                 action._newer_actions.append(self)
             context.newest_moves.update(dict.fromkeys((member.name for member in self._members), self))
@@ -181,27 +209,7 @@ class FleetAction:
         try:
             if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
-            has_newer_order = self._newer_order_checks.get(member.name) or self._newer_order_check(member)
-            is_overruled = (self._moves_members or self._arms) and (
-                # A landing without a delay is sent even if there is a newer action, because that action may fail.
-                has_newer_order() or (not self._is_safe and self._has_newer_action(member))
-            )
-            while wait_s > START_TOLERANCE_S and not is_overruled:
-                await self._wait_to_start(member, wait_s)
-                is_overruled = has_newer_order() or self._has_newer_action(member)
-                # After a blocked event loop, the delays of several members may end at once. Each of them then waits
-                # until `stagger_s` after the last start.
-                wait_s = self._last_start_at + self._stagger_s - self._context.now()
-            if is_overruled:
-                raise OperationRejected(
-                    f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
-                )
-            self._last_start_at = self._context.now()
-            # An action that starts this member later must not treat this action's order as newer.
-            for action in self._context.actions:
-                action._newer_order_checks.pop(member.name, None)
-            if not member.is_available:
-                raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
+            await self._wait_to_start(member, wait_s)
             value = await self._execute_in_time(member)
         except AerokitError as error:
             if member.name not in self._stopped:
@@ -219,11 +227,32 @@ class FleetAction:
             del self._tasks[member.name]
             self._check_finished()
 
-    async def _wait_to_start(self, member: Member, delay_s: float) -> None:
-        """Wait ``delay_s`` and for a recent HEARTBEAT.
+    async def _wait_to_start(self, member: Member, wait_s: float) -> None:
+        """Wait until the member may start. Raises OperationRejected or HeartbeatTimeout if it must not start."""
+        before = self._orders_before.get(member.name) or self._orders_of(member)
+        is_overruled = (self._moves_members or self._kind is ActionKind.ARMS) and (
+            # A landing without a delay is sent even if there is a newer action, because that action may fail.
+            self._has_order_since(member, before) or (not self._ends_flight and self._has_newer_action(member))
+        )
+        while wait_s > START_TOLERANCE_S and not is_overruled:
+            await self._wait(member, wait_s)
+            is_overruled = self._has_order_since(member, before) or self._has_newer_action(member)
+            # After a blocked event loop, the delays of several members may end at once. Each of them then waits
+            # until `stagger_s` after the last start.
+            wait_s = self._last_start_at + self._stagger_s - self._context.now()
+        if is_overruled:
+            raise OperationRejected(
+                f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
+            )
+        self._last_start_at = self._context.now()
+        # An action that starts this member later must not treat this action's order as newer.
+        for action in self._context.actions:
+            action._orders_before.pop(member.name, None)
+        if not member.is_available:
+            raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
 
-        Raises OperationRejected or HeartbeatTimeout if the member must not start after this wait.
-        """
+    async def _wait(self, member: Member, delay_s: float) -> None:
+        """Wait ``delay_s`` and for a recent HEARTBEAT. Raises as `_wait_to_start` does."""
         connection, name = member.vehicle.connection, member.name
         began_at, absences = connection.now(), member.absences
         await anyio.sleep(delay_s)
@@ -234,7 +263,7 @@ class FleetAction:
         if not member.is_available:
             raise OperationRejected(f"{self.name}: {name} is {member.status}")
         # A landing is sent even to a member that was unavailable during the wait.
-        if member.absences > absences and not self._is_safe:
+        if member.absences > absences and not self._ends_flight:
             raise OperationRejected(f"{self.name}: {name} was unavailable before it started; nothing was sent to it")
         late_s = connection.now() - began_at - delay_s
         if self._corridors is not None and late_s > self._corridors.slack_s:
@@ -255,27 +284,25 @@ class FleetAction:
         return any(
             member in action._members and not action._has_failed_or_stopped(member)
             for action in self._newer_actions
-            if action._is_safe or not self._arms
+            if action._ends_flight or self._kind is not ActionKind.ARMS
         )
 
-    def _newer_order_check(self, member: Member) -> Callable[[], bool]:
-        """Return a function that returns True after a newer order of the program to land, return or disarm.
+    @property
+    def _ends_flight(self) -> bool:
+        return self._kind is ActionKind.ENDS_FLIGHT
 
-        If this action arms the members, orders to arm count, too.
-        """
-        arbiter, order_before = member.vehicle._arbiter, _newest_order(member)
+    def _orders_of(self, member: Member) -> _SentOrders:
+        arbiter = member.vehicle._arbiter
+        is_arming = self._kind is ActionKind.ARMS
+        commands = arbiter.arm_commands_sent if is_arming else arbiter.disarm_commands_sent
+        return _SentOrders(_newest_order(member), commands)
 
-        def commands_sent() -> int:
-            return arbiter.arm_commands_sent if self._arms else arbiter.disarm_commands_sent
-
-        commands_before = commands_sent()
-
-        def has_newer_order() -> bool:
-            has_landed = _newest_order(member) is not order_before and _is_ending_flight(member)
-            # A command to disarm does not prevent a landing, because a vehicle in the air refuses to disarm.
-            return has_landed or (not self._is_safe and commands_sent() > commands_before)
-
-        return has_newer_order
+    def _has_order_since(self, member: Member, before: _SentOrders) -> bool:
+        """Return True if the program has since ordered to land, return or disarm or, if this action arms, to arm."""
+        newest, command_count = self._orders_of(member)
+        must_land = newest is not before.newest and _is_ending_flight(member)
+        # A command to disarm does not prevent a landing, because a vehicle in the air refuses to disarm.
+        return must_land or (not self._ends_flight and command_count > before.command_count)
 
     async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
@@ -292,67 +319,71 @@ class FleetAction:
         self._outcomes[member.name] = error
         member.record_failure(self.name, error)
         # The program flies a released member separately, so its failure does not concern the others.
-        if self._is_safe or self._context.is_closed or member.state is MemberState.RELEASED:
+        if self._ends_flight or self._context.is_closed or member.state is MemberState.RELEASED:
             return
-        self._undecided.append((member, error))
+        self._undecided.append(member)
         # `_apply_policy` refreshes the other members, which can call this method again. The outer call then handles
         # the new failure.
         if len(self._undecided) > 1:
             return
         while self._undecided:
-            if self._policy_trigger is None:  # The policy has not given orders in this action yet.
-                self._apply_policy(*self._undecided[0])
+            if self._policy_cause is None:  # The policy has not given orders in this action yet.
+                self._apply_policy(self._undecided[0])
             del self._undecided[0]
 
     # ------------------------------------------------------------------------------ other members
 
-    def _apply_policy(self, failed: Member, error: Exception) -> None:
+    def _apply_policy(self, failed: Member) -> None:
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
         available = [member for member in others if member.is_available]
-        failure = MemberFailure(failed.name, failed.group, self.name, error, tuple(member.name for member in available))
+        error, names = self._failed[failed.name], tuple(member.name for member in available)
+        failure = MemberFailure(failed.name, failed.group, self.name, error, others=names)
         orders = self._decide(failure)
         if not orders:
             return
-        self._policy_trigger = (failed.vehicle.system_id, failed.name)
+        self._policy_cause = failed
         self._cancel_tasks_of([failed])
         skipped = {member.name: member.reason for member in others if not member.is_available}
-        for member in available:
-            order = orders.get(member.name)
-            if order is None:
-                continue
-            if self._has_newer_order(member):
-                skipped[member.name] = "it has a newer order"
-            elif member.is_flown_by_program:
-                self._policy_orders[member.name] = order
-            elif member.vehicle.is_confirmed_disarmed:
-                skipped[member.name] = "it is disarmed"
+        stopping = [member for member in available if member.name in orders]
+        for member in stopping:
+            if reason := self._reason_to_skip(member):
+                skipped[member.name] = reason
             else:
-                skipped[member.name] = "this program does not fly it"
+                self._policy_orders[member.name] = orders[member.name]
             has_finished = member.name in self._outcomes
             # If a member has finished the action and gets no order, its outcome stays.
             if member.name in self._policy_orders or not has_finished:
                 self._set_stopped(member, failed, self._policy_orders.get(member.name))
-        system_id, name = self._policy_trigger
-        now = self._context.now()
+        now, system_id = self._context.now(), failed.vehicle.system_id
         self._context.publish(
-            PolicyApplied(now, system_id, name, action=self.name, orders={**self._policy_orders}, skipped=skipped)
+            PolicyApplied(now, system_id, failed.name, action=self.name, orders=self.policy_orders, skipped=skipped)
         )
-        self._pending_policy_orders = len(self._policy_orders)
-        for member in available:
-            if member.name in self._policy_orders:
-                task = self._context.background.start(
-                    partial(self._send_order, member, self._policy_orders[member.name]), f"aerokit policy {member.name}"
-                )
-                if task is not None:  # The callback runs even if the task is cancelled before it begins.
-                    task.add_done_callback(partial(self._on_order_end, member.name))
+        self._send_policy_orders([member for member in stopping if member.name in self._policy_orders])
         # The running actions are cancelled one loop iteration later. By then, the policy's orders have superseded those
         # of the actions, so that the cancelled actions do not send a hold.
-        stopping = [member for member in available if member.name in orders]
         asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
         if not self._policy_orders:
             self._publish_completed()
+
+    def _reason_to_skip(self, member: Member) -> str:
+        """Return why the policy must not send the member an order; an empty string if it may."""
+        if self._has_newer_order(member):
+            return "it has a newer order"
+        if member.is_flown_by_program:
+            return ""
+        return "it is disarmed" if member.vehicle.is_confirmed_disarmed else "this program does not fly it"
+
+    def _send_policy_orders(self, members: Sequence[Member]) -> None:
+        self._pending_policy_orders = len(members)
+        for member in members:
+            order = self._policy_orders[member.name]
+            task = self._context.background.start(
+                partial(self._send_order, member, order), f"aerokit policy {member.name}"
+            )
+            if task is not None:  # The callback runs even if the task is cancelled before it begins.
+                task.add_done_callback(partial(self._on_order_end, member.name))
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
         try:
@@ -396,16 +427,16 @@ class FleetAction:
             self._check_finished()
 
     def _publish_completed(self) -> None:
-        assert self._policy_trigger is not None
-        system_id, name = self._policy_trigger
-        now, errors = self._context.now(), dict(self._policy_order_errors)
+        failed = self._policy_cause
+        assert failed is not None
+        now, system_id, errors = self._context.now(), failed.vehicle.system_id, dict(self._policy_order_errors)
         self._context.publish(
-            PolicyCompleted(now, system_id, name, action=self.name, orders={**self._policy_orders}, errors=errors)
+            PolicyCompleted(now, system_id, failed.name, action=self.name, orders=self.policy_orders, errors=errors)
         )
 
     def _hold_finished_members(self) -> None:
         # Members that still execute the action hold when it is cancelled. Members that have finished it need an order.
-        for member in self._members if self._holds_if_cancelled else ():
+        for member in self._members if self._kind in (ActionKind.MOVES, ActionKind.OTHER) else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
             if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
                 self._context.hold(member, f"aerokit hold {member.name}")
@@ -508,30 +539,6 @@ class FleetContext:
             action.on_member_unavailable(member)
 
 
-# If one member fails in these actions, the other members continue, because the actions make the flight safer.
-FLIGHT_ENDING_ACTIONS = ("hold", "land", "return_to_launch", "disarm", "mission.pause")
-
-# If these actions are cancelled, members do not hold, because the actions do not move them.
-ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
-
-
-# These actions and `FLIGHT_ENDING_ACTIONS` overrule older actions.
-MOVING_ACTIONS = (
-    "take_off",
-    "go_to",
-    "form",
-    "show",
-    "set_mode",
-    "set_heading",
-    "orbit",
-    "loiter",
-    "figure_eight",
-    "land_on",
-    "mission.start",
-    "mission.resume",
-)
-
-
 class SelectionBase:
     """Base class of a selection: its members, and the execution of actions by all of them."""
 
@@ -580,18 +587,7 @@ class SelectionBase:
     ) -> FleetResult:
         members = [member for member in self if names is None or member.name in names]
         # A function of the program may have the name of a built-in action.
-        built_in_action = "" if is_function else name
-        is_safe = built_in_action in FLIGHT_ENDING_ACTIONS
+        kind = ActionKind.OTHER if is_function else KINDS.get(name, ActionKind.OTHER)
         return await FleetAction(
-            self._context,
-            name,
-            members,
-            execute,
-            timeout=timeout,
-            stagger_s=stagger_s,
-            is_safe=is_safe,
-            holds_if_cancelled=not is_safe and built_in_action not in ACTIONS_ON_GROUND,
-            moves_members=is_safe or built_in_action in MOVING_ACTIONS,
-            arms=built_in_action == "arm",
-            corridors=corridors,
+            self._context, name, members, execute, timeout=timeout, stagger_s=stagger_s, kind=kind, corridors=corridors
         ).run()

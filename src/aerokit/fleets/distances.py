@@ -56,20 +56,21 @@ def altitude_amsl(member: Member, target: Position) -> float:
 
 
 class LocalOrigin:
-    """Converts positions to metres north and east of an origin and metres above sea level, and back."""
+    """Converts positions to metres north, east and up of an origin (by default at sea level), and back."""
 
-    def __init__(self, origin: Position) -> None:
-        self._origin = origin
+    def __init__(self, origin: Position, altitude_amsl_m: float = 0.0) -> None:
+        self._origin, self._altitude_amsl_m = origin, altitude_amsl_m
 
     def to_local(self, position: Position, altitude_amsl_m: float) -> LocalPoint:
         north, east = geo.north_east_m(
             self._origin.latitude_deg, self._origin.longitude_deg, position.latitude_deg, position.longitude_deg
         )
-        return north, east, altitude_amsl_m
+        return north, east, altitude_amsl_m - self._altitude_amsl_m
 
     def to_position(self, point: LocalPoint) -> Position:
-        north_m, east_m, altitude_amsl_m = point
+        north_m, east_m, up_m = point
         position = self._origin.offset(north_m=north_m, east_m=east_m)
+        altitude_amsl_m = up_m + self._altitude_amsl_m
         return Position(position.latitude_deg, position.longitude_deg, altitude_amsl_m=altitude_amsl_m)
 
     def local_position_of(self, member: Member) -> LocalPoint:

@@ -21,13 +21,13 @@ from aerokit.errors import (
     SetpointStreamStopped,
     ValueUnknownError,
 )
-from aerokit.fleets.action import FleetAction
+from aerokit.fleets.action import ActionKind, FleetAction
 from aerokit.fleets.distances import POSITION_MAX_AGE_S, altitude_amsl, position_of
 from aerokit.fleets.events import FollowingStopped
 from aerokit.fleets.members import Member
 from aerokit.fleets.policy import FleetResult
 from aerokit.fleets.separation import to_local_points
-from aerokit.fleets.travel import Travel
+from aerokit.fleets.travel import FlightOptions, Travel
 from aerokit.position import Position
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
@@ -234,7 +234,9 @@ class Following:
             raise BusyError("a Following can be entered only once; call following() again")
         _check_leader(self._leader)
         self._was_entered = True
-        self._action = FleetAction(self._context, "following", self._followers, self._fly_follower, moves_members=True)
+        self._action = FleetAction(
+            self._context, "following", self._followers, self._fly_follower, kind=ActionKind.MOVES
+        )
         self._tasks.start(self._follow, "aerokit following")
         return self
 
@@ -386,7 +388,7 @@ class Formations(Travel):
             targets[follower.name] = target
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        return await self._travel("form", targets, speed_m_s, timeout)
+        return await self._travel("form", targets, FlightOptions(speed_m_s, timeout))
 
     def following(
         self, formation: Formation, *, leader: str, rate_hz: float = 5.0, max_speed_m_s: float = 10.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, ExitStack, contextmanager
 from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
 
@@ -116,20 +116,14 @@ async def fleet(
         given_names = {name for source in sources if isinstance(source, Mapping) for name in source}
         members = _members_of_vehicles(sources_by_name, given_names, networks)
         searched = [name for name, source in sources_by_name.items() if not isinstance(source, Vehicle)]
-        ids = await find_systems(
-            {name: networks[name] for name in searched},
-            requested=_requested_ids(system_ids, searched),
-            count=count,
-            passed_count=len(members),
-            timeout=timeout,
-        )
-        systems: list[tuple[str, Connection, int]] = []
-        for name in searched:
-            systems += [(name, networks[name], system_id) for system_id in ids[name]]
+        searched_networks = {name: networks[name] for name in searched}
+        requested = _requested_ids(system_ids, searched)
+        ids = await _Discovery(searched_networks, requested, count, passed_count=len(members)).run(timeout)
+        systems = [_System(name, networks[name], system_id) for name in searched for system_id in ids[name]]
         connections = MemberConnections(timeout, rates)
         stack.push_async_exit(connections.aclose)
-        for name, vehicle in await connections.open(systems):
-            members.append(Member(f"{name}/{vehicle.system_id}", name, vehicle))
+        for system, vehicle in zip(systems, await connections.open(systems), strict=True):
+            members.append(Member(system.name, system.network, vehicle))
         _check_names(members)
         now = next(iter(networks.values())).now  # the clock of the event loop, which all connections share
         context = FleetContext(members, networks, rules, now=now, on_error=_raise, min_distance_m=min_distance_m)
@@ -225,88 +219,83 @@ def _raise(error: Exception) -> None:
 # --------------------------------------------------------------------------------------- discovery
 
 
-async def find_systems(
-    networks: Mapping[str, Connection],
-    requested: Mapping[str, list[int] | None],
-    count: int | None,
-    passed_count: int,
-    timeout: float,
-) -> dict[str, list[int]]:
-    """Wait for vehicles; return the system ids to connect to, by network.
+class _Discovery:
+    """Finds the system ids to connect to, by network: the requested ones, or all found that have no vehicle object yet.
 
-    These system ids are the requested ones or, without a request, all ids found that have no vehicle object yet.
-
-    Args:
-        networks: connections by name.
-        requested: system ids by network; None instead of a list means all that are found.
-        count: total number of vehicles to wait for, including ``passed_count``; None: at least one on each network.
-        passed_count: number of vehicles that the program passed to ``fleet()``.
-        timeout: seconds to wait.
-
-    Raises:
-        ConnectFailed: not enough vehicles were found in time.
-        LinkLost, ConnectionClosed: a link that is searched has ended.
+    ``requested`` maps networks to system ids, or to None for all. ``count`` is the total number of vehicles to wait
+    for, with the ``passed_count`` vehicles that the program passed to ``fleet()``; None: at least one on each network.
     """
-    searched = [name for name in networks if requested[name] is None]
-    # The system ids of each network: first those that were requested, then those that are found. The inner dicts serve
-    # as ordered sets.
-    found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
-    changed = anyio.Event()
 
-    def on_heartbeat(name: str, heartbeat: Heartbeat) -> None:
-        frame = heartbeat.received_frame
-        assert frame is not None
-        if is_autopilot(heartbeat) and frame.system_id not in networks[name].attached:
-            found[name].setdefault(frame.system_id)
-            changed.set()
+    def __init__(
+        self,
+        networks: Mapping[str, Connection],
+        requested: Mapping[str, list[int] | None],
+        count: int | None,
+        passed_count: int,
+    ) -> None:
+        self._networks, self._count, self._passed_count = networks, count, passed_count
+        self._searched = [name for name in networks if requested[name] is None]
+        # The system ids of each network: first those that were requested, then those that are found. The inner dicts
+        # serve as ordered sets.
+        self._found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
+        self._changed = asyncio.Event()
 
-    def is_complete() -> bool:
-        if count is not None:
-            return passed_count + sum(map(len, found.values())) >= count
-        return all(found[name] for name in searched)
+    async def run(self, timeout: float) -> dict[str, list[int]]:
+        """Wait for the vehicles. Raises ConnectFailed or, if a link that is searched has ended, its error."""
+        with ExitStack() as stack:
+            self._attach(stack)
+            with anyio.move_on_after(timeout):
+                with warn_while_waiting(timeout, self._describe):
+                    await self._wait_until_complete()
+                if self._searched and self._count is None:
+                    await anyio.sleep(DISCOVERY_S)
+        if not self._is_complete:
+            silent = (name for name in self._searched if not self._found[name])
+            reasons = [f"\n  - network {name}: {explain_no_vehicle(self._networks[name], None)}" for name in silent]
+            raise ConnectFailed(f"within {timeout:g} s {self._describe()}{''.join(reasons)}")
+        return {name: sorted(ids) for name, ids in self._found.items()}
 
-    def describe_progress() -> str:
-        names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
-        listed = ", ".join(names)
-        if count is not None:
-            found_count = passed_count + len(names)
-            text = f"{found_count or 'none'} of {count} vehicles were found"
-            if passed_count:
-                text += f", {passed_count} of them passed as vehicles"
-            return f"{text}: {listed}" if names else text
-        silent_networks = ", ".join(name for name in searched if not found[name])
-        text = f"no vehicle was found on {silent_networks}"
-        return f"{text}; found: {listed}" if names else text
-
-    detachments = []
-    try:
-        for name in searched:
-            connection = networks[name]
+    def _attach(self, stack: ExitStack) -> None:
+        for name in self._searched:
+            connection = self._networks[name]
             connection.raise_if_ended()
             # Not the events VehicleFound, because a vehicle that returns is not found again.
-            detachments.append(connection.bus.attach(Heartbeat, partial(on_heartbeat, name)))
-            detachments.append(connection.on_end(lambda _: changed.set()))
+            stack.callback(connection.bus.attach(Heartbeat, partial(self._on_heartbeat, name)))
+            stack.callback(connection.on_end(lambda _: self._changed.set()))
             for source, heartbeat in connection.heartbeats.items():
                 if connection.now() - connection.last_heartbeat_at(*source) <= HEARTBEAT_MAX_AGE_S:
-                    on_heartbeat(name, heartbeat)
-        with anyio.move_on_after(timeout):
-            with warn_while_waiting(timeout, describe_progress):
-                while not is_complete():
-                    for name in searched:
-                        networks[name].raise_if_ended()
-                    changed = anyio.Event()
-                    await changed.wait()
-            if searched and count is None:
-                await anyio.sleep(DISCOVERY_S)
-    finally:
-        for detach in detachments:
-            detach()
-    if not is_complete():
-        reasons = "".join(
-            f"\n  - network {name}: {explain_no_vehicle(networks[name], None)}" for name in searched if not found[name]
-        )
-        raise ConnectFailed(f"within {timeout:g} s {describe_progress()}{reasons}")
-    return {name: sorted(ids) for name, ids in found.items()}
+                    self._on_heartbeat(name, heartbeat)
+
+    @property
+    def _is_complete(self) -> bool:
+        if self._count is not None:
+            return self._passed_count + sum(map(len, self._found.values())) >= self._count
+        return all(self._found[name] for name in self._searched)
+
+    async def _wait_until_complete(self) -> None:
+        while not self._is_complete:
+            for name in self._searched:
+                self._networks[name].raise_if_ended()
+            self._changed.clear()
+            await self._changed.wait()
+
+    def _describe(self) -> str:
+        names = [f"{name}/{system_id}" for name, ids in self._found.items() for system_id in ids]
+        listed = ", ".join(names)
+        if self._count is not None:
+            text = f"{self._passed_count + len(names) or 'none'} of {self._count} vehicles were found"
+            if self._passed_count:
+                text += f", {self._passed_count} of them passed as vehicles"
+            return f"{text}: {listed}" if names else text
+        text = f"no vehicle was found on {', '.join(name for name in self._searched if not self._found[name])}"
+        return f"{text}; found: {listed}" if names else text
+
+    def _on_heartbeat(self, name: str, heartbeat: Heartbeat) -> None:
+        frame = heartbeat.received_frame
+        assert frame is not None
+        if is_autopilot(heartbeat) and frame.system_id not in self._networks[name].attached:
+            self._found[name].setdefault(frame.system_id)
+            self._changed.set()
 
 
 @contextmanager
@@ -326,6 +315,18 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
         timer.cancel()
 
 
+class _System(NamedTuple):
+    """A vehicle to connect to."""
+
+    network: str
+    connection: Connection
+    system_id: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.network}/{self.system_id}"
+
+
 class _BlockFailed(Exception):
     """Raised in each vehicle's block if the fleet's block has failed, so that a vehicle left flying is logged."""
 
@@ -336,7 +337,7 @@ class MemberConnections:
     def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
         self._timeout, self._rates = timeout, rates
         self._tasks = BackgroundTasks(self._on_error)
-        self._connected: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
+        self._connected: dict[_System, Vehicle] = {}
         self._error: Exception | None = None
         self._changed = asyncio.Event()  # set after each connection and each error
         self._close = asyncio.Event()  # set at the end of the fleet's block
@@ -344,19 +345,14 @@ class MemberConnections:
         self._running_task_count = 0
         self._all_closed = asyncio.Event()
 
-    async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
-        """Connect to systems, given as tuples of network, connection and system id.
-
-        Returns the network and the vehicle of each system, in the same order.
-        """
-        for index, (network, connection, system_id) in enumerate(systems):
+    async def open(self, systems: Sequence[_System]) -> list[Vehicle]:
+        """Connect to systems, and return their vehicles in the same order."""
+        for system in systems:
             self._running_task_count += 1
-            self._tasks.start(partial(self._run, index, network, connection, system_id))
+            self._tasks.start(partial(self._run, system))
 
         def describe_missing() -> str:
-            names = [f"{network}/{system_id}" for network, _, system_id in systems]
-            missing = (name for index, name in enumerate(names) if index not in self._connected)
-            return f"no heartbeat of {', '.join(missing)}"
+            return f"no heartbeat of {', '.join(system.name for system in systems if system not in self._connected)}"
 
         with warn_while_waiting(self._timeout, describe_missing):
             while len(self._connected) < len(systems) and self._error is None:
@@ -364,7 +360,7 @@ class MemberConnections:
                 await self._changed.wait()
         if self._error is not None:
             raise self._error
-        return [self._connected[index] for index in range(len(systems))]
+        return [self._connected[system] for system in systems]
 
     async def aclose(
         self,
@@ -383,10 +379,11 @@ class MemberConnections:
     async def _wait_until_all_closed(self) -> None:
         await self._all_closed.wait()
 
-    async def _run(self, index: int, network: str, connection: Connection, system_id: int) -> None:
+    async def _run(self, system: _System) -> None:
+        connection, system_id = system.connection, system.system_id
         try:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
-                self._connected[index] = (network, vehicle)
+                self._connected[system] = vehicle
                 self._changed.set()
                 await self._close.wait()
                 if self._has_block_failed:  # connect() must close the vehicle as after an error in its own block.

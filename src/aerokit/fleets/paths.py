@@ -6,9 +6,9 @@ Points are in metres north, east and up of a common origin. Times are in seconds
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -39,6 +39,13 @@ class PathPoint(Snapshot):
     def _check(self) -> None:
         if not all(math.isfinite(value) for value in (self.t_s, *self.place)):
             raise InvalidArgument(f"{self!r} is not allowed: all numbers must be finite")
+
+
+class Leg(NamedTuple):
+    """A straight line between two points of a path."""
+
+    start: PathPoint
+    end: PathPoint
 
 
 class Path(Snapshot):
@@ -72,8 +79,8 @@ class Path(Snapshot):
         """Time of the last point in seconds."""
         return self.points[-1].t_s
 
-    def legs(self, begin_s: float, end_s: float) -> list[tuple[PathPoint, PathPoint]]:
-        """Return the legs of the path, as pairs of points.
+    def legs(self, begin_s: float, end_s: float) -> list[Leg]:
+        """Return the legs of the path.
 
         The vehicle rests at the first point from ``begin_s`` on, and at the last point until ``end_s``; these rests are
         legs, too.
@@ -84,7 +91,7 @@ class Path(Snapshot):
             *self.points,
             last.replace(t_s=max(end_s, last.t_s)),
         ]
-        return list(pairwise(points))
+        return [Leg(start, end) for start, end in pairwise(points)]
 
     def _check(self) -> None:
         # A copy, so that the caller may change its own list later. Plain assignment would raise, because the class is
@@ -107,10 +114,6 @@ class Approach(Snapshot):
     other_at_s: float
 
 
-Leg = tuple[PathPoint, PathPoint]
-"""A straight line between two points of a path."""
-
-
 def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, below_m: float = math.inf) -> Approach:
     """Return the closest approach of two paths.
 
@@ -126,16 +129,14 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
     best = Approach(math.inf, begin_s, begin_s)
     other_legs = other.legs(begin_s, end_s)
     for leg in path.legs(begin_s, end_s):
-        start, end = leg
         for other_leg in other_legs:
-            other_start, other_end = other_leg
-            is_other_later = other_start.t_s - slack_s > end.t_s
-            is_other_earlier = other_end.t_s + slack_s < start.t_s
+            is_other_later = other_leg.start.t_s - slack_s > leg.end.t_s
+            is_other_earlier = other_leg.end.t_s + slack_s < leg.start.t_s
             if is_other_later or is_other_earlier:  # the vehicles never fly these legs at the same time
                 continue
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
                 if best.distance_m == math.inf:  # These legs are at least `below_m` apart; other legs may be closer.
-                    best = Approach(below_m, start.t_s, other_start.t_s)
+                    best = Approach(below_m, leg.start.t_s, other_leg.start.t_s)
                 continue
             approach = _closest(leg, other_leg, slack_s)
             if approach is not None and approach.distance_m < best.distance_m:
@@ -153,7 +154,7 @@ def horizontal_distance(line: tuple[LocalPoint, LocalPoint], other: tuple[LocalP
 def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
     north_m, east_m, _ = start
     end_north_m, end_east_m, _ = end
-    return PathPoint(0.0, north_m, east_m, up_m=0.0), PathPoint(0.0, end_north_m, end_east_m, up_m=0.0)
+    return Leg(PathPoint(0.0, north_m, east_m, up_m=0.0), PathPoint(0.0, end_north_m, end_east_m, up_m=0.0))
 
 
 def _lower_bound(leg: Leg, other: Leg) -> float:
@@ -162,13 +163,11 @@ def _lower_bound(leg: Leg, other: Leg) -> float:
 
 
 def _length(leg: Leg) -> float:
-    start, end = leg
-    return math.dist(start.place, end.place)
+    return math.dist(leg.start.place, leg.end.place)
 
 
 def _midpoint(leg: Leg) -> tuple[float, ...]:
-    start, end = leg
-    return tuple((a + b) / 2 for a, b in zip(start.place, end.place, strict=True))
+    return tuple((a + b) / 2 for a, b in zip(leg.start.place, leg.end.place, strict=True))
 
 
 def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
@@ -228,7 +227,7 @@ def _closest_inside(
     return (s, t) if 0 <= s <= 1 and 0 <= t <= 1 else None
 
 
-def _clip(corners: list[tuple[float, float]], outside: _Outside) -> list[tuple[float, float]]:
+def _clip(corners: list[tuple[float, float]], outside: Callable[[float, float], float]) -> list[tuple[float, float]]:
     """Return the part of a convex polygon where ``outside`` is not positive (Sutherland-Hodgman)."""
     clipped: list[tuple[float, float]] = []
     for index, corner in enumerate(corners):
@@ -269,9 +268,3 @@ def _difference(point: Sequence[float], other: Sequence[float]) -> list[float]:
 
 def _dot(vector: Sequence[float], other: Sequence[float]) -> float:
     return vector[0] * other[0] + vector[1] * other[1] + vector[2] * other[2]
-
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    _Outside = Callable[[float, float], float]  # a function of s and t that is positive outside of the border

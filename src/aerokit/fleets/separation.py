@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations, product
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -175,10 +175,8 @@ def separate_by_time(
     refusal = ""
     sequence = list(routes)
     for _ in routes:  # at most one try for each route
-        delays, blocked_route, blocker = _delays(
-            sequence, resting, min_distance_m, speed_m_s, slack_s=slack_s, max_delay_s=max_delay_s
-        )
-        if blocked_route is None:
+        delays = _delays(sequence, resting, min_distance_m, speed_m_s, slack_s=slack_s, max_delay_s=max_delay_s)
+        if not isinstance(delays, _Blocked):
             delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
             max_s = max(delays.values())
             reason = f"{describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
@@ -191,9 +189,10 @@ def separate_by_time(
                 slack_s=slack_s,
                 speed_m_s=speed_m_s,
             )
-        refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
+        blocked = delays.route
+        refusal = f"{blocked.name} would have to wait for {delays.blocker} longer than {max_delay_s:g} s"
         # A route waits only for routes before it in the sequence, so the next try begins with the blocked route.
-        sequence = [blocked_route, *(route for route in sequence if route is not blocked_route)]
+        sequence = [blocked, *(route for route in sequence if route is not blocked)]
     return Deconfliction("refused", refusal, min_distance_m, conflicts)
 
 
@@ -217,6 +216,13 @@ def resting_paths(stationary: Mapping[str, LocalPoint]) -> list[Path]:
     return [Path(name, (PathPoint(0.0, *point),)) for name, point in stationary.items()]
 
 
+class _Blocked(NamedTuple):
+    """A route that would need more than the maximum delay."""
+
+    route: Route
+    blocker: str  # name of the vehicle for which it would have to wait
+
+
 def _delays(
     sequence: Sequence[Route],
     resting_paths: Sequence[Path],
@@ -225,12 +231,8 @@ def _delays(
     *,
     slack_s: float,
     max_delay_s: float,
-) -> tuple[dict[str, float], Route | None, str]:
-    """Find the delays in seconds that prevent all conflicts, route by route in this sequence.
-
-    If a route needs more than the maximum, return the delays so far, this route, and the name of the vehicle that
-    blocks it.
-    """
+) -> dict[str, float] | _Blocked:
+    """Find the delays in seconds that prevent all conflicts, route by route in this sequence."""
     delayed_paths: list[Path] = []
     delays: dict[str, float] = {}
     for route in sequence:
@@ -242,10 +244,10 @@ def _delays(
                 break
             delay_s += DELAY_STEP_S
             if delay_s > max_delay_s:
-                return delays, route, blocker
+                return _Blocked(route, blocker)
         delayed_paths.append(path)
         delays[route.name] = delay_s
-    return delays, None, ""
+    return delays
 
 
 def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float) -> str:

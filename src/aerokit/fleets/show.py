@@ -15,7 +15,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit._internal.files import read_bounded, write_atomically
 from aerokit._internal.values import Snapshot
@@ -181,21 +181,28 @@ class Show(Snapshot):
                     raise InvalidArgument(f"tracks[{name!r}] has two positions at {end.t_s:g} s")
 
 
-def state_at(path: Path, at_s: float) -> tuple[LocalPoint, LocalPoint]:
-    """Return the position (metres north, east, up) and the velocity (m/s) on a path at a time."""
+class PathState(NamedTuple):
+    """Position and velocity on a path, in metres and m/s north, east and up."""
+
+    place: LocalPoint
+    velocity: LocalPoint
+
+
+def state_at(path: Path, at_s: float) -> PathState:
+    """Return the position and the velocity on a path at a time."""
     points = path.points
     next_index = bisect_right(points, at_s, key=_time_of)
     if next_index == 0:
-        return points[0].place, (0.0, 0.0, 0.0)
+        return PathState(points[0].place, (0.0, 0.0, 0.0))
     if next_index == len(points):
-        return points[-1].place, (0.0, 0.0, 0.0)
+        return PathState(points[-1].place, (0.0, 0.0, 0.0))
     start, end = points[next_index - 1], points[next_index]  # The end is later than `at_s`, so the duration is not 0.
     duration_s = end.t_s - start.t_s
     fraction = (at_s - start.t_s) / duration_s
     vector = [b - a for a, b in zip(start.place, end.place, strict=True)]
     place = tuple(a + fraction * d for a, d in zip(start.place, vector, strict=True))
     velocity = tuple(d / duration_s for d in vector)
-    return place, velocity  # type: ignore[return-value]
+    return PathState(place, velocity)  # type: ignore[arg-type]
 
 
 def _time_of(point: PathPoint) -> float:

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from aerokit.fleets.paths import LocalPoint
     from aerokit.vehicle.vehicle import Vehicle
 
+    TrackSample = tuple[float, LocalPoint]  # seconds since the start of the show, and metres north, east and up
+
 __all__ = [
     "ClockOffset",
     "ShowReport",
@@ -165,8 +167,8 @@ class ShowReport(Snapshot):
     max_relative_error_m: float | None
 
 
-def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
-    """Compare a path with measured positions: ``samples`` has (seconds since the start of the show, position).
+def track_deviation(path: Path, samples: Sequence[TrackSample]) -> TrackDeviation:
+    """Compare a path with measured positions.
 
     The lag is the time by which the path must be delayed to fit the samples best (least squares along the track).
     """
@@ -189,7 +191,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
 
 
 def max_relative_error(
-    paths: Mapping[str, Path], samples: Mapping[str, Sequence[tuple[float, LocalPoint]]], duration_s: float
+    paths: Mapping[str, Path], samples: Mapping[str, Sequence[TrackSample]], duration_s: float
 ) -> float | None:
     """Return the largest difference, in metres, between the planned and the flown vector from one vehicle to another.
 
@@ -203,8 +205,7 @@ def max_relative_error(
         for name, path in paths.items():
             point = _interpolate(samples.get(name, ()), at_s)
             if point is not None:
-                planned, _ = state_at(path, at_s)
-                errors.append(_difference(planned, point))
+                errors.append(_difference(state_at(path, at_s).place, point))
         if len(errors) > 1:
             relative_errors = (math.dist(first, second) for first, second in combinations(errors, 2))
             largest_m = max(largest_m or 0.0, *relative_errors)
@@ -216,7 +217,7 @@ def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
     return north, east, up
 
 
-def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
+def _interpolate(samples: Sequence[TrackSample], at_s: float) -> LocalPoint | None:
     """Return the position at a time between two samples; None if there are no such samples."""
     for (start_s, start), (end_s, end) in pairwise(samples):
         if start_s <= at_s <= end_s:
@@ -232,21 +233,18 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 class TrackRecorder:
     """Records a vehicle's track while the recorder's ``with`` block runs, from GLOBAL_POSITION_INT.
 
-    Each sample has the seconds since the start of the show, and metres north, east and up of the show's origin.
-
     Times are ``time_boot_ms``, converted by the clock offset that TIMESYNC has measured. If TIMESYNC turns out to use
     another clock than ``time_boot_ms``, the times at which the messages arrived are used instead.
     """
 
-    def __init__(
-        self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin_at: float, origin_amsl_m: float
-    ) -> None:
-        self._vehicle, self._clock, self._begin_at, self._origin_amsl_m = vehicle, clock, begin_at, origin_amsl_m
-        position = origin.to_position((0.0, 0.0, origin_amsl_m))
+    def __init__(self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin_at: float) -> None:
+        self._vehicle, self._clock, self._begin_at = vehicle, clock, begin_at
+        position = origin.to_position((0.0, 0.0, 0.0))
         self._latitude, self._longitude = position.latitude_deg, position.longitude_deg
+        self._altitude_amsl_m = position.altitude_amsl_m or 0.0
         metres_per_degree = _metres_per_degree(origin, self._latitude, self._longitude)
         self._metres_per_latitude_degree, self._metres_per_longitude_degree = metres_per_degree
-        self.samples: list[tuple[float, LocalPoint]] = []  # seconds since the start of the show, and position
+        self.samples: list[TrackSample] = []
         self._latest: tuple[float, LocalPoint, LocalPoint] | None = None  # time, position and velocity
         self._detach: Detach | None = None
 
@@ -289,7 +287,7 @@ class TrackRecorder:
         place = (
             (latitude - self._latitude) * self._metres_per_latitude_degree,
             math.remainder(longitude - self._longitude, 360.0) * self._metres_per_longitude_degree,
-            message.alt / 1000 - self._origin_amsl_m,
+            message.alt / 1000 - self._altitude_amsl_m,
         )
         self._latest = measured_at, place, (message.vx / 100, message.vy / 100, -message.vz / 100)
         if measured_at >= self._begin_at:
@@ -321,8 +319,7 @@ class Shows(Travel):
             InvalidArgument: the name of a track is not that of a member.
             ValueUnknownError: the position of the first member is unknown.
         """
-        local_origin, origin_amsl_m = self._local_origin(show, origin)
-        return self._start_positions(show, local_origin, origin_amsl_m)
+        return self._start_positions(show, self._local_origin(show, origin))
 
     async def fly_show(
         self,
@@ -363,14 +360,14 @@ class Shows(Travel):
         check_range("rate_hz", rate_hz, 2, 50)
         check_range("start_in_s", start_in_s, 0, 3600)
         check_range("lead_s", lead_s or 0.0, 0, 10)
-        local_origin, origin_amsl_m = self._local_origin(show, origin)
-        self._check_show(show, local_origin, origin_amsl_m)
+        local_origin = self._local_origin(show, origin)
+        self._check_show(show, local_origin)
         names = tuple(show.tracks)
         orders_before = {name: self._context.newest_orders(self.members[name]) for name in names}
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
         self._check_not_ordered_since(orders_before, "fly_show", "the show was not started")
-        start_positions = self._start_positions(show, local_origin, origin_amsl_m)
+        start_positions = self._start_positions(show, local_origin)
         arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         for name in names:
@@ -382,7 +379,7 @@ class Shows(Travel):
         with ExitStack() as stack:
             for name in names:
                 vehicle = self.members[name].vehicle
-                recorder = TrackRecorder(vehicle, clocks[name], local_origin, begin_at, origin_amsl_m)
+                recorder = TrackRecorder(vehicle, clocks[name], local_origin, begin_at)
                 recorders[name] = stack.enter_context(recorder)
 
             async def fly(member: Member) -> None:
@@ -392,51 +389,33 @@ class Shows(Travel):
                 )
 
             result = await self._run("show", fly, names=names)
-        samples = {name: recorder.samples for name, recorder in recorders.items()}
-        tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
-        lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
-        offsets = {name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)}
-        return ShowReport(
-            result=result,
-            tracks=tracks,
-            clocks=offsets,
-            lag_spread_s=max(lags) - min(lags) if lags else None,
-            max_relative_error_m=max_relative_error(show.tracks, samples, show.duration_s),
-        )
+        return _report(show, result, clocks, {name: recorder.samples for name, recorder in recorders.items()})
 
     # --------------------------------------------------------------------------------------- private
 
-    def _local_origin(self, show: Show, origin: Position) -> tuple[LocalOrigin, float]:
-        """Return the origin of the show's metres, and its altitude above sea level."""
+    def _local_origin(self, show: Show, origin: Position) -> LocalOrigin:
         for name in show.tracks:
             if name not in self.members:
                 raise InvalidArgument(f"show: {short_repr(name)} is not a member; members: {', '.join(self.members)}")
         if origin.altitude_amsl_m is not None:
-            return LocalOrigin(origin), origin.altitude_amsl_m
+            return LocalOrigin(origin, origin.altitude_amsl_m)
         first_member = self.members[next(iter(show.tracks))]  # its home defines the altitude
         above_home = origin.replace(altitude_relative_m=origin.altitude_relative_m or 0.0)
-        return LocalOrigin(origin), altitude_amsl(first_member, above_home)
+        return LocalOrigin(origin, altitude_amsl(first_member, above_home))
 
     @staticmethod
-    def _start_positions(show: Show, origin: LocalOrigin, origin_amsl_m: float) -> dict[str, Position]:
-        starts = {name: track.points[0] for name, track in show.tracks.items()}
-        return {
-            name: origin.to_position((start.north_m, start.east_m, start.up_m + origin_amsl_m))
-            for name, start in starts.items()
-        }
+    def _start_positions(show: Show, origin: LocalOrigin) -> dict[str, Position]:
+        return {name: origin.to_position(track.points[0].place) for name, track in show.tracks.items()}
 
-    def _check_show(self, show: Show, origin: LocalOrigin, origin_amsl_m: float) -> None:
+    def _check_show(self, show: Show, origin: LocalOrigin) -> None:
         for name in show.tracks:
             self._check_available(self.members[name], "fly_show", "nothing was sent")
         min_m = self._context.min_distance_m
         if min_m is None:
             return
         stationary = stationary_members(self._context.members, origin, moving=show.tracks)
-        above_origin = {
-            name: (north, east, amsl_m - origin_amsl_m) for name, (north, east, amsl_m) in stationary.items()
-        }
         tracks = [track.replace(name=name) for name, track in show.tracks.items()]
-        paths = [*tracks, *resting_paths(above_origin)]
+        paths = [*tracks, *resting_paths(stationary)]
         conflicts = [
             conflict
             for conflict in find_conflicts(paths, min_m, slack_s=CONFLICT_SLACK_S)
@@ -449,6 +428,20 @@ class Shows(Travel):
                 f"fly_show: {conflict.name} and {conflict.other} come within {conflict.distance_m:.1f} m of each"
                 f" other{more}, closer than the minimum of {min_m:g} m; nothing was sent"
             )
+
+
+def _report(
+    show: Show, result: FleetResult, clocks: FleetResult, samples: Mapping[str, Sequence[TrackSample]]
+) -> ShowReport:
+    tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
+    lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
+    return ShowReport(
+        result=result,
+        tracks=tracks,
+        clocks={name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)},
+        lag_spread_s=max(lags) - min(lags) if lags else None,
+        max_relative_error_m=max_relative_error(show.tracks, samples, show.duration_s),
+    )
 
 
 async def _fly_track(
@@ -480,11 +473,10 @@ async def _fly_track(
 
 def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> VelocitySetpoint:
     """Return the velocity of the path at ``at_s + lead_s``, corrected for the deviation at ``at_s``."""
-    planned, _ = state_at(path, at_s)
-    _, velocity = state_at(path, at_s + lead_s)
+    velocity = state_at(path, at_s + lead_s).velocity
     speed = math.hypot(*velocity)
     north, east, up = follow_velocity(
-        _difference(planned, position),
+        _difference(state_at(path, at_s).place, position),
         velocity,
         gain=TRACK_GAIN,
         max_speed_m_s=max(CATCH_UP_FACTOR * speed, CATCH_UP_M_S) + CATCH_UP_M_S,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import anyio
 
@@ -38,6 +38,15 @@ MAX_PLAN_DRIFT_M = 3.0
 
 SeparationMethod = Literal["layers", "corridors", "refuse"]
 """Method to separate crossing paths: by altitude (layers), by time (corridors), or not at all (refuse)."""
+
+
+class FlightOptions(NamedTuple):
+    """Options of :meth:`Travel.go_to` that apply to each leg."""
+
+    speed_m_s: float | None = None
+    timeout: float | None = None
+    max_distance_m: float = MAX_DISTANCE_M
+    stagger_s: float | None = None
 
 
 @checks_arguments
@@ -85,16 +94,8 @@ class Travel(SelectionBase):
         names = tuple(self.members) if callable(targets) else tuple(positions)
         for name, target in positions.items():
             self.members[name].vehicle._position.check_reach(f"targets[{name!r}]", [target], max_distance_m)
-        return await self._travel(
-            "go_to",
-            positions,
-            speed_m_s,
-            timeout,
-            stagger_s=stagger_s,
-            separation=separation,
-            names=names,
-            max_distance_m=max_distance_m,
-        )
+        options = FlightOptions(speed_m_s, timeout, max_distance_m, stagger_s)
+        return await self._travel("go_to", positions, options, separation, names=names)
 
     def plan_separation(
         self,
@@ -152,13 +153,10 @@ class Travel(SelectionBase):
         self,
         action: str,
         targets: Mapping[str, Position],
-        speed_m_s: float | None,
-        timeout: float | None,
-        stagger_s: float | None = None,
+        options: FlightOptions,
         separation: Deconfliction | None = None,
         *,
         names: tuple[str, ...] = (),
-        max_distance_m: float = MAX_DISTANCE_M,
     ) -> FleetResult:
         """Fly members to their targets, directly or with the planned separation.
 
@@ -167,34 +165,22 @@ class Travel(SelectionBase):
         if separation is not None:
             self._check_plan(action, targets, separation)
         elif self._context.min_distance_m is not None:
-            separation = self.plan_separation(targets, speed_m_s=speed_m_s)
+            separation = self.plan_separation(targets, speed_m_s=options.speed_m_s)
         if separation is None or separation.decision == "clear":
-            return await self._fly_to(
-                action, targets, speed_m_s, timeout, max_distance_m=max_distance_m, names=names, stagger_s=stagger_s
-            )
+            return await self._fly_to(action, targets, options, names=names)
         if separation.decision == "refused":
             raise OperationRejected(f"{action}: {separation.reason}; nothing was sent")
         if separation.decision == "corridors":
-            if stagger_s:
+            if options.stagger_s:
                 raise InvalidArgument(f"{action}: stagger_s would change the delays of corridors; nothing was sent")
-            if speed_m_s != separation.speed_m_s:
+            if options.speed_m_s != separation.speed_m_s:
                 raise InvalidArgument(
-                    f"{action}: speed_m_s = {speed_m_s} is not allowed: the separation by time was planned for"
+                    f"{action}: speed_m_s = {options.speed_m_s} is not allowed: the separation by time was planned for"
                     f" {separation.speed_m_s} m/s; nothing was sent"
                 )
-            return await self._fly_to(
-                action, targets, speed_m_s, timeout, max_distance_m=max_distance_m, names=names, corridors=separation
-            )
+            return await self._fly_to(action, targets, options, names=names, corridors=separation)
         heights_m = separation.heights_m
-        result = await self._fly_in_layers(
-            action,
-            targets,
-            speed_m_s,
-            timeout,
-            heights_m=heights_m,
-            max_distance_m=max_distance_m,
-            stagger_s=stagger_s,
-        )
+        result = await self._fly_in_layers(action, targets, options, heights_m)
         result.skipped |= {name: self.members[name].status for name in names or targets if name not in heights_m}
         return result
 
@@ -256,31 +242,28 @@ class Travel(SelectionBase):
         self,
         action: str,
         targets: Mapping[str, Position],
-        speed_m_s: float | None,
-        timeout: float | None,
+        options: FlightOptions,
         *,
-        max_distance_m: float,
         names: tuple[str, ...] = (),
-        stagger_s: float | None = None,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
         async def fly(member: Member) -> None:
             await member.vehicle.go_to(
-                targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
+                targets[member.name],
+                speed_m_s=options.speed_m_s,
+                timeout=options.timeout,
+                max_distance_m=options.max_distance_m,
             )
 
-        return await self._run(action, fly, stagger_s=stagger_s, names=names or tuple(targets), corridors=corridors)
+        names = names or tuple(targets)
+        return await self._run(action, fly, stagger_s=options.stagger_s, names=names, corridors=corridors)
 
     async def _fly_in_layers(
         self,
         action: str,
         targets: Mapping[str, Position],
-        speed_m_s: float | None,
-        timeout: float | None,
-        *,
+        options: FlightOptions,
         heights_m: Mapping[str, float],
-        max_distance_m: float,
-        stagger_s: float | None,
     ) -> FleetResult:
         starts = {name: position_of(self._context.members[name]) for name in heights_m}
         climb = {name: _at_altitude(starts[name], height) for name, height in heights_m.items()}
@@ -298,9 +281,7 @@ class Travel(SelectionBase):
                 self._check_not_ordered_since(
                     result._final_orders, action, "the others stay at their assigned altitudes"
                 )
-            result = await self._fly_to(
-                action, leg, speed_m_s, timeout, max_distance_m=max_distance_m, stagger_s=stagger_s
-            )
+            result = await self._fly_to(action, leg, options)
             if not result.is_complete:
                 break
         assert result is not None

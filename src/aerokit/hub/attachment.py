@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
-from aerokit.hub.port import UNLIMITED, EndpointCounters, Port, SigningGateway, joined
+from aerokit.hub.port import UNLIMITED, EndpointCounters, FrameSigner, Port, joined
 from aerokit.hub.senders import IdentityGuard
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.values import EndpointStatistics
@@ -64,8 +64,8 @@ class Attachment:
         self.is_open: bool = False
         self._owns_link = False  # True once this object has opened the link, and therefore must close it
         self._reports_bursts = False  # True if the link calls `burst_ended`
-        # True if the link has a single remote end, e.g. a serial port. Its `Port` has the key None.
-        self._is_single = False
+        # True for e.g. a serial port. The key of its `Port` is None.
+        self._has_single_peer = False
         self._burst: list[bytes] = []  # datagrams of `_burst_peer` that are not processed yet
         self._burst_peer: Peer = None
         self._ports: dict[Peer, Port] = {}
@@ -77,9 +77,9 @@ class Attachment:
         self.counters: EndpointCounters = EndpointCounters(Counter())
         self._totals_of_forgotten_peers = _Totals(0, 0, 0, 0)
         self._reported_refusals: set[str] = set()  # reasons that were already reported
-        self._gateway: SigningGateway | None = None  # verifies and adds signatures
+        self._signer: FrameSigner | None = None  # verifies and adds signatures
         if endpoint.signing is not None:
-            self._gateway = SigningGateway(endpoint.signing, dialect.extras, self._on_refused)
+            self._signer = FrameSigner(endpoint.signing, dialect.extras, self._on_refused)
 
     async def open(self) -> None:
         await self.link.open(self)
@@ -103,8 +103,8 @@ class Attachment:
             totals = totals.plus(framer)
         systems: set[tuple[int, int]] = set()
         for port in ports:
-            if port.node is not None:
-                systems.update(router.senders_at(port.node))
+            if port.ingress is not None:
+                systems.update(router.senders_at(port.ingress))
         dropped = {reason: count for reason, count in self.counters.dropped.items() if count}
         if self.link.dropped_writes:
             dropped["link"] = self.link.dropped_writes
@@ -155,7 +155,7 @@ class Attachment:
             now = self._now()
             # Frames of our own program come without a socket, and therefore have not waited.
             arrived_at = now if self._is_shared else self._switch.arrival(now)
-            port_peer = None if self._is_single else peer
+            port_peer = None if self._has_single_peer else peer
             framer = self._peers.framers.get(port_peer)
             is_whole = False  # True if the data consists of whole valid frames and nothing else
             if framer is not None:
@@ -206,8 +206,8 @@ class Attachment:
 
     def _on_up(self) -> None:
         self.is_open, self._reports_bursts = True, self.link.reports_bursts
-        self._is_single = self.link.has_peer(None)
-        if self._is_single and None not in self._ports:
+        self._has_single_peer = self.link.has_peer(None)
+        if self._has_single_peer and None not in self._ports:
             self._add_port(None)
 
     def _on_down(self) -> None:
@@ -228,8 +228,8 @@ class Attachment:
             period=self.filters.period,
             report=partial(self._report, self),
             on_drop=self._on_drop,
-            gateway=self._gateway,
-            guard=None if self._is_single else self._guard,
+            signer=self._signer,
+            guard=None if self._has_single_peer else self._guard,
             is_read_only=self.endpoint.read_only,
         )
         self._guard.has_several_peers = len(self._ports) > 1

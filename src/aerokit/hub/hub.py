@@ -95,7 +95,7 @@ class Hub:
         """
         if self._switch is not None:
             raise BusyError("a hub can be entered only once; make a new one")
-        self._switch = Switch(self._dialect, _period, self._on_port_error)
+        self._switch = Switch(self._dialect, self._on_port_error)
         self._switch.router.on_change = self._on_change
         self._background = BackgroundTasks(self._on_background_error)
         self._background.start(self._flush_recording, "aerokit hub")
@@ -300,10 +300,6 @@ class Hub:
 
 def _as_endpoint(endpoint: str | Endpoint | Link) -> Endpoint:
     return endpoint if isinstance(endpoint, Endpoint) else Endpoint(endpoint)
-
-
-def _period(port: Port, message_id: int) -> float | None:
-    return port.period(message_id)
 
 
 async def _wait_until_closed(attachments: list[Attachment]) -> None:

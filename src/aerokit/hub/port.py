@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable, Mapping
 
-    from aerokit.hub.routing import ForwardingPlan, RouterPort
+    from aerokit.hub.routing import ForwardingPlan, Ingress
     from aerokit.hub.senders import IdentityGuard
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.dialect import Dialect
@@ -35,6 +35,13 @@ class QueuedFrame(NamedTuple):
     waiting_since: float  # loop time
 
 
+class DroppedFrame(NamedTuple):
+    """A frame that was removed from a queue. ``reason`` is a key of `EndpointStatistics.dropped`."""
+
+    reason: str
+    frame: QueuedFrame
+
+
 class FrameQueue:
     """Queue in which newer telemetry replaces older telemetry with the same message id and sender.
 
@@ -54,33 +61,30 @@ class FrameQueue:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def put(self, frame: QueuedFrame, key: int) -> list[tuple[str, QueuedFrame]]:
-        """Add a frame. Return the frames that were dropped for it, with the reasons.
-
-        ``key`` identifies the sender and the message.
-        """
-        dropped: list[tuple[str, QueuedFrame]] = []
+    def put(self, frame: QueuedFrame, key: int) -> list[DroppedFrame]:
+        """Add a frame. Return the frames that were dropped for it. ``key`` identifies the sender and the message."""
+        dropped: list[DroppedFrame] = []
         if frame.kind is MessageKind.TELEMETRY:
             replaced = self._frames.get(key)
             if replaced is not None:
                 self._bytes += len(frame.raw) - len(replaced.raw)
                 self._frames[key] = frame
-                return [("superseded", replaced)]
+                return [DroppedFrame("superseded", replaced)]
         else:
             self._last_key -= 1  # The key is unique, so that no other frame replaces this one.
             key = self._last_key
         while self._is_full(len(frame.raw)):
             if not self._telemetry_count:
-                return [*dropped, ("queue_full", frame)]
+                return [*dropped, DroppedFrame("queue_full", frame)]
             oldest_telemetry = next(
                 queued_key for queued_key, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY
             )
-            dropped.append(("queue_full", self._remove(oldest_telemetry)))
+            dropped.append(DroppedFrame("queue_full", self._remove(oldest_telemetry)))
         self._frames[key] = frame
         self._count(frame, 1)
         return dropped
 
-    def expire(self, now: float) -> list[tuple[str, QueuedFrame]]:
+    def expire(self, now: float) -> list[DroppedFrame]:
         """Remove and return the commands that have waited too long."""
         if not self._order_count:
             return []
@@ -89,7 +93,7 @@ class FrameQueue:
             for key, queued in self._frames.items()
             if queued.kind is MessageKind.ORDER and now - queued.waiting_since > ORDER_MAX_AGE_S
         ]
-        return [("late", self._remove(key)) for key in late]
+        return [DroppedFrame("late", self._remove(key)) for key in late]
 
     def pop(self) -> bytes | None:
         """Remove and return the first frame. Call :meth:`expire` before."""
@@ -98,8 +102,8 @@ class FrameQueue:
         first_key = next(iter(self._frames))
         return self._remove(first_key).raw
 
-    def clear(self) -> list[tuple[str, QueuedFrame]]:
-        dropped = [("link_lost", frame) for frame in self._frames.values()]
+    def clear(self) -> list[DroppedFrame]:
+        dropped = [DroppedFrame("link_lost", frame) for frame in self._frames.values()]
         self._frames.clear()
         self._bytes = self._order_count = self._telemetry_count = 0
         return dropped
@@ -131,29 +135,29 @@ def _to_mavlink2(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
     return bytes((MAGIC_V2,)) + body + x25(body + crc_extra).to_bytes(2, "little")
 
 
-class SigningGateway:
+class FrameSigner:
     """Signs frames that leave an endpoint; verifies and removes the signatures of received frames.
 
     ``unix_time`` is in seconds since 1970. MAVLink 1 frames are sent as MAVLink 2, and refused on reception unless
     ``allow_unsigned`` of the `Signing` accepts them. Messages outside the dialect cannot be signed, because their
-    checksum cannot be calculated. ``refused(frame, reason)`` is called for each refused frame.
+    checksum cannot be calculated. ``on_refused(frame, reason)`` is called for each refused frame.
     """
 
     def __init__(
-        self, signing: Signing, crc_extras: Mapping[int, bytes], refused: Callable[[Frame, str], object]
+        self, signing: Signing, crc_extras: Mapping[int, bytes], on_refused: Callable[[Frame, str], object]
     ) -> None:
         self.signing = signing
-        self._extras, self._refused = crc_extras, refused
+        self._extras, self._on_refused = crc_extras, on_refused
 
     def verify(self, frame: Frame, unix_time: float) -> Frame | None:
         """Return a received frame without its signature; None if the frame is refused."""
         try:
             refusal = self.signing.check(frame, unix_time)
         except Exception as error:  # `check` calls the program's function `allow_unsigned`.
-            self._refused(frame, f"allow_unsigned raised {error!r}")
+            self._on_refused(frame, f"allow_unsigned raised {error!r}")
             return None
         if refusal is not None:
-            self._refused(frame, refusal.value)
+            self._on_refused(frame, refusal.value)
             return None
         return self.strip_signature(frame)
 
@@ -215,7 +219,7 @@ class Port:
         period: Callable[[int], float | None],
         report: Callable[[HubEventKind, str], object],
         on_drop: Callable[[str, QueuedFrame], object],
-        gateway: SigningGateway | None = None,
+        signer: FrameSigner | None = None,
         guard: IdentityGuard | None = None,
         is_read_only: bool = False,
     ) -> None:
@@ -225,7 +229,7 @@ class Port:
         self.period: Callable[[int], float | None] = period
         self.report: Callable[[HubEventKind, str], object] = report
         self.reports_bursts: bool = link.reports_bursts
-        self.gateway: SigningGateway | None = gateway
+        self.signer: FrameSigner | None = signer
         self.guard: IdentityGuard | None = guard
         self.is_read_only: bool = is_read_only
         """True if no received frame is forwarded."""
@@ -233,9 +237,7 @@ class Port:
         """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
         """Data to write: each element is one frame, or several frames joined."""
-        self.joined_frames: int = 0
-        """Number of frames in ``batch`` minus the number of its pieces, for the counters."""
-        self.node: RouterPort[Port] | None = None
+        self.ingress: Ingress[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes = queue_above_bytes
         self._may_queue = queue_above_bytes < UNLIMITED  # False if frames never wait
@@ -244,16 +246,12 @@ class Port:
         self._due: dict[int, float] = {}  # maps keys of rate-limited streams to the time of their next frame
 
     @property
-    def has_queued_frames(self) -> bool:
-        return bool(self._queue)
-
-    @property
     def waiting(self) -> int:
         return len(self._queue)
 
     @property
     def joins_frames(self) -> bool:
-        return self.gateway is None and not self.writes_single_frames
+        return self.signer is None and not self.writes_single_frames
 
     def must_queue(self) -> bool:
         return self._may_queue and (bool(self._queue) or self._is_full())
@@ -266,7 +264,7 @@ class Port:
             kind = kind_of(message_type.NAME, has_target=system_id != 0)
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
-    def is_due(self, key: int, period_s: float, now: float) -> bool:
+    def passes_rate_limit(self, key: int, period_s: float, now: float) -> bool:
         """Return True if the rate limit allows a frame now. Otherwise count it as dropped.
 
         ``key`` identifies the sender and the message.
@@ -287,11 +285,10 @@ class Port:
 
     def flush(self, unix_time: float) -> None:
         batch, self.batch = self.batch, []
-        if self.gateway is not None:
+        if self.signer is not None:
             batch = self._signed(batch, unix_time)
         counters, write, peer = self.counters, self.link.write, self.peer
-        counters.frames_out += len(batch) + self.joined_frames
-        self.joined_frames = 0
+        counters.frames_out += len(batch)  # `Switch` has counted the further frames of joined pieces.
         is_joined = len(batch) > 1 and not self.writes_single_frames
         for piece in joined(batch) if is_joined else batch:
             counters.bytes_out += len(piece)
@@ -309,24 +306,24 @@ class Port:
         self._drop(self._queue.expire(math.inf))
 
     def drop_late(self, frame: Frame, target: tuple[int, int], arrived_at: float) -> None:
-        self._drop([("late", QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, arrived_at))])
+        queued = QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, arrived_at)
+        self._drop([DroppedFrame("late", queued)])
 
     def close(self) -> None:
         self._drop(self._queue.clear())
         self.batch.clear()
-        self.joined_frames = 0
         self._due.clear()
 
     def _is_full(self) -> bool:
         return self.link.unsent_bytes_to(self.peer) > self._queue_above_bytes
 
     def _signed(self, batch: list[bytes], unix_time: float) -> list[bytes]:
-        assert self.gateway is not None
-        signed = [self.gateway.sign(raw, unix_time) for raw in batch]
+        assert self.signer is not None
+        signed = [self.signer.sign(raw, unix_time) for raw in batch]
         self.counters.dropped["unsignable"] += signed.count(None)
         return [raw for raw in signed if raw is not None]
 
-    def _drop(self, dropped: list[tuple[str, QueuedFrame]]) -> None:
+    def _drop(self, dropped: list[DroppedFrame]) -> None:
         for reason, frame in dropped:
             self.counters.dropped[reason] += 1
             self._on_drop(reason, frame)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from aerokit.hub.message_rules import TargetFields
+    from aerokit.hub.senders import FrameRecord
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.frame import Frame
 
@@ -67,13 +68,13 @@ class ForwardingPlan(Generic[PortT]):
         self.is_plain: bool = not (rate_limited or reason)
         """True if each frame goes to `outs`, and nothing else is to be done."""
         self.sender: Sender = sender
-        """The sender of the frames; used in the plans of `RouterPort.streams`."""
+        """The sender of the frames; used in the plans of `Ingress.streams`."""
         self.identity: int = sender.source << 24
         """The sender's part of the numbers in `RecentFrames`."""
 
 
-class RouterPort(Generic[PortT]):
-    """One port, and what the router stores for it."""
+class Ingress(Generic[PortT]):
+    """Data of the router for the frames that arrive at one port."""
 
     __slots__ = ("destinations", "echoes", "loop_until", "number", "plans", "port", "streams")
 
@@ -126,7 +127,7 @@ class Router(Generic[PortT]):
     def __init__(self, targets: TargetFields, period: Callable[[PortT, int], float | None]) -> None:
         self._targets, self._period = targets, period
         self._offsets = targets.offsets
-        self._nodes: dict[int, RouterPort[PortT]] = {}  # by port number
+        self._ingresses: dict[int, Ingress[PortT]] = {}  # by port number
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
         self._port_count = 0  # number of ports created so far
@@ -138,52 +139,52 @@ class Router(Generic[PortT]):
         self.on_autopilot: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, the port of the frame, and another port of this sender.
+        """Called with the kind of event, the sender, the port of the frame, and the port at which it came before.
 
-        The other port depends on the kind. After a move, it is the sender's previous port. If the sender is received at
-        two ports, it is the port to which messages for the sender are forwarded. In a loop, it is the port at which its
-        frames arrive first. It is None if that port was removed since.
+        The last one is None if that port was removed since.
         """
 
-    def add(self, port: PortT) -> RouterPort[PortT]:
+    def add(self, port: PortT) -> Ingress[PortT]:
         self._port_count += 1
-        node = self._nodes[self._port_count] = RouterPort(port, self._port_count)
+        ingress = self._ingresses[self._port_count] = Ingress(port, self._port_count)
         self.forget_plans()
-        return node
+        return ingress
 
-    def remove(self, node: RouterPort[PortT]) -> None:
-        if self._nodes.pop(node.number, None) is not None:
-            for key in [key for key, sender in self._senders.items() if sender.remove_port(node.number)]:
+    def remove(self, ingress: Ingress[PortT]) -> None:
+        if self._ingresses.pop(ingress.number, None) is not None:
+            for key in [key for key, sender in self._senders.items() if sender.remove_port(ingress.number)]:
                 del self._senders[key]
                 self._without_heartbeat.pop(key, None)
             self.forget_plans()
 
     def forget_plans(self) -> None:
-        for node in self._nodes.values():
-            node.forget_plans()
+        for ingress in self._ingresses.values():
+            ingress.forget_plans()
 
     @property
     def ports(self) -> Iterable[PortT]:
-        return (node.port for node in self._nodes.values())
+        return (ingress.port for ingress in self._ingresses.values())
 
     def exclude_pause(self, now: float, paused_s: float) -> None:
         for sender in self._senders.values():
             sender.exclude_pause(now, paused_s)
 
-    def senders_at(self, node: RouterPort[PortT]) -> list[tuple[int, int]]:
+    def senders_at(self, ingress: Ingress[PortT]) -> list[tuple[int, int]]:
         return sorted(
-            (sender.system_id, sender.component_id) for sender in self._senders.values() if node.number in sender.ports
+            (sender.system_id, sender.component_id)
+            for sender in self._senders.values()
+            if ingress.number in sender.ports
         )
 
     def route_all(
-        self, node: RouterPort[PortT], frames: list[Frame], now: float, late: list[Frame]
+        self, ingress: Ingress[PortT], frames: list[Frame], now: float, late: list[Frame]
     ) -> list[ForwardingPlan[PortT]]:
-        """Return the plans for frames received together at ``node``. Those in ``late`` are out of order."""
+        """Return the plans for frames received together at ``ingress``. Those in ``late`` are out of order."""
         # This is the hot path for new frames of known streams. `route` processes frames that are out of order or may
         # return in a loop, and all frames while the tables of recent frames are full or have expired.
-        recent, streams, port_number = self._recent, node.streams, node.number
-        if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
-            return [self.route(node, frame, now, frame in late) for frame in frames]
+        recent, streams, port_number = self._recent, ingress.streams, ingress.number
+        if late or ingress.echoes or now >= recent.rotate_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
+            return [self.route(ingress, frame, now, frame in late) for frame in frames]
         newer, older, plans = recent.newer, recent.older, []
         record = port_number, self._port_count, now  # value for `RecentFrames.newer`
         for frame in frames:
@@ -199,15 +200,15 @@ class Router(Generic[PortT]):
                     plan.sender.received_at = now
                     plans.append(plan)
                     continue
-            plans.append(self.route(node, frame, now))
-            if node.echoes:
+            plans.append(self.route(ingress, frame, now))
+            if ingress.echoes:
                 # A frame came back. From now on, `route` must process every frame, because it counts returning and new
                 # frames in `echoes` to detect a loop.
                 streams = {}
         return plans
 
-    def route(self, node: RouterPort[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
-        """Return the plan for a frame received at ``node``. ``is_late``: the frame is out of order."""
+    def route(self, ingress: Ingress[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
+        """Return the plan for a frame received at ``ingress``. ``is_late``: the frame is out of order."""
         # Hot path. Sender and target are numbers: system id + 256 · component id.
         body, message_id = frame.body, frame.message_id
         source = body[4] | body[5] << 8
@@ -215,23 +216,23 @@ class Router(Generic[PortT]):
         if sender is None:
             if message_id not in self._offsets and self._targets.is_unknown(message_id):
                 return self._unknown  # The checksum of an unknown message cannot be checked, so the frame may be noise.
-            sender = self._add_sender(source, node, now)
-        number, recent = node.number, self._recent
-        if now >= recent.ends_at or len(recent.newer) >= MAX_RECENT_FRAMES:
-            recent.start_generation(now)
+            sender = self._add_sender(source, ingress, now)
+        number, recent = ingress.number, self._recent
+        if now >= recent.rotate_at or len(recent.newer) >= MAX_RECENT_FRAMES:
+            recent.rotate(now)
         identity = source << 24 | body[3] << 16 | frame.checksum
         earlier = recent.newer.get(identity) or recent.older.get(identity)
         if earlier is None:
             recent.newer[identity] = number, self._port_count, now
-            if node.echoes:
-                self._record_new(node, source)
+            if ingress.echoes:
+                self._record_new_frame(ingress, source)
         elif self._is_copy(earlier, number, now, is_late):
             return self._duplicate
         elif self._is_echo(earlier, number, now):
             first_port, port_count, _ = earlier
             # Too late for a copy: the frame returns in a slow loop, or equals an earlier one by chance, like the first
             # command of a restarted program. It is forwarded until several frames prove a loop.
-            if self._is_loop(node, source, first_port, now):
+            if self._record_echo(ingress, source, first_port, now):
                 return self._loop
             recent.newer[identity] = first_port, port_count, now
         else:
@@ -241,9 +242,9 @@ class Router(Generic[PortT]):
         else:
             # An autopilot has priority over other senders with its ids, so it moves to this port at once.
             must_move = not (message_id or sender.is_autopilot) and is_autopilot(body)
-            self._record_at_other_port(sender, node, now, must_move)
+            self._record_at_other_port(sender, ingress, now, must_move)
         if not message_id:
-            self._record_heartbeat(sender, node, body)
+            self._record_heartbeat(sender, ingress, body)
         try:
             offsets = self._offsets[message_id]
         except KeyError:
@@ -258,15 +259,15 @@ class Router(Generic[PortT]):
                     target |= body[component_offset] << 8
         key = message_id << 32 | target << 16 | source
         try:
-            return node.plans[key]
+            return ingress.plans[key]
         except KeyError:
-            return self._plan(node, key)
+            return self._plan(ingress, key)
 
     # ------------------------------------------------------------------------------------ senders
 
-    def _add_sender(self, source: int, node: RouterPort[PortT], now: float) -> Sender:
+    def _add_sender(self, source: int, ingress: Ingress[PortT], now: float) -> Sender:
         """Create a sender, and store it if there is room."""
-        sender = Sender(source, node.number, now)
+        sender = Sender(source, ingress.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
             self._without_heartbeat[source] = None
@@ -284,14 +285,14 @@ class Router(Generic[PortT]):
                 del self._senders[source]
         return len(self._senders) < MAX_ROUTES
 
-    def _record_at_other_port(self, sender: Sender, node: RouterPort[PortT], now: float, must_move: bool) -> None:
+    def _record_at_other_port(self, sender: Sender, ingress: Ingress[PortT], now: float, must_move: bool) -> None:
         former_number = sender.port_number
-        if sender.record_at_other_port(node.number, now, must_move):
+        if sender.record_at_other_port(ingress.number, now, must_move):
             self.forget_plans()
         if sender.is_autopilot and sender.port_number != former_number:
-            self._report("route_changed", sender.source, node, former_number)
+            self._report("route_changed", sender.source, ingress, former_number)
 
-    def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
+    def _is_copy(self, earlier: FrameRecord, number: int, now: float, is_late: bool) -> bool:
         """Return True if a frame that equals an earlier frame is a copy of it."""
         # A restarted program numbers its frames from the start again, so its first command may equal an earlier frame.
         # A frame that was received at the same port and in sequence is therefore no copy.
@@ -299,55 +300,55 @@ class Router(Generic[PortT]):
         if first_port == number:
             return is_late and now - received_at <= REPEAT_WINDOW_S
         existed_then = number <= port_count  # This port already existed when the earlier frame arrived.
-        return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
+        return first_port in self._ingresses and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
-    def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
+    def _is_echo(self, earlier: FrameRecord, number: int, now: float) -> bool:
         """Return True if an equal frame arrived at another port recently, while port ``number`` already existed."""
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
 
-    def _is_loop(self, node: RouterPort[PortT], source: int, first_port: int, now: float) -> bool:
+    def _record_echo(self, ingress: Ingress[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True while a loop is proven."""
-        count = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
-        node.echoes[source] = count
-        was_proven = now < node.loop_until
+        count = min(ingress.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
+        ingress.echoes[source] = count
+        was_proven = now < ingress.loop_until
         if count < MIN_LOOP_FRAMES and not was_proven:
             return False
         if not was_proven:
-            self._report("loop", source, node, first_port)
-        node.loop_until = now + LOOP_WINDOW_S
+            self._report("loop", source, ingress, first_port)
+        ingress.loop_until = now + LOOP_WINDOW_S
         return True
 
-    def _record_new(self, node: RouterPort[PortT], source: int) -> None:
+    def _record_new_frame(self, ingress: Ingress[PortT], source: int) -> None:
         # A new frame is no echo.
-        count = node.echoes.pop(source, 0) - 1
+        count = ingress.echoes.pop(source, 0) - 1
         if count > 0:
-            node.echoes[source] = count
+            ingress.echoes[source] = count
 
-    def _report(self, kind: HubEventKind, source: int, node: RouterPort[PortT], other_number: int) -> None:
+    def _report(self, kind: HubEventKind, source: int, ingress: Ingress[PortT], other_number: int) -> None:
         if self.on_change is not None:
-            other_node = self._nodes.get(other_number)
-            self.on_change(kind, source, node.port, None if other_node is None else other_node.port)
+            other = self._ingresses.get(other_number)
+            self.on_change(kind, source, ingress.port, None if other is None else other.port)
 
-    def _record_heartbeat(self, sender: Sender, node: RouterPort[PortT], body: bytes) -> None:
+    def _record_heartbeat(self, sender: Sender, ingress: Ingress[PortT], body: bytes) -> None:
         is_first = sender.source in self._without_heartbeat
         self._without_heartbeat.pop(sender.source, None)
         # A HEARTBEAT at another port may come from a second sender with the same ids. It must not turn a vehicle into a
         # ground station.
-        if (is_first or sender.port_number == node.number) and sender.record_heartbeat(body):
+        if (is_first or sender.port_number == ingress.number) and sender.record_heartbeat(body):
             self.forget_plans()
-        if sender.is_autopilot and node.number not in sender.reported:
-            sender.reported.add(node.number)
+        if sender.is_autopilot and ingress.number not in sender.autopilot_ports:
+            sender.autopilot_ports.add(ingress.number)
             self.forget_plans()
             if self.on_autopilot is not None:
-                self.on_autopilot(node.port)
-            if sender.port_number != node.number:  # The autopilot was received at another port before.
-                self._report("duplicate_sender", sender.source, node, sender.port_number)
+                self.on_autopilot(ingress.port)
+            if sender.port_number != ingress.number:  # The autopilot was received at another port before.
+                self._report("duplicate_sender", sender.source, ingress, sender.port_number)
 
     # -------------------------------------------------------------------------------------- plans
 
-    def _plan(self, node: RouterPort[PortT], key: int) -> ForwardingPlan[PortT]:
-        """Make the plan for a key of `RouterPort.plans`, and cache it."""
+    def _plan(self, ingress: Ingress[PortT], key: int) -> ForwardingPlan[PortT]:
+        """Make the plan for a key of `Ingress.plans`, and cache it."""
         message_id, target, source = key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF
         target_system, target_component = target & 0xFF, target >> 8
         ids = target_system, target_component
@@ -358,22 +359,22 @@ class Router(Generic[PortT]):
         has_target = target_system != 0
         # The keys of the dictionary are used as a set that keeps its order.
         if has_target:
-            numbers = self._ports_to(target_system, target_component, source, node.number)
+            numbers = self._ports_to(target_system, target_component, source, ingress.number)
             if not numbers:
                 # This plan is not cached, because a sender could fill the cache with unknown targets.
                 return ForwardingPlan(stream_key, message_id, ids, reason="no_route")
         else:
-            numbers = dict.fromkeys(self._nodes)
+            numbers = dict.fromkeys(self._ingresses)
             if self._targets.is_command(message_id):
                 # An autopilot that is received at two ports gets a command once, and does not get its own command.
                 numbers = {number: None for number in numbers if not self._is_redundant(number, sender)}
-        numbers.pop(node.number, None)
+        numbers.pop(ingress.number, None)
         # Any autopilot would adapt its message rates to this radio, even if the radio is not its own.
         if message_id in _RADIOS:
             numbers = {number: None for number in numbers if not self._has_autopilot(number)}
         outs, rate_limited = [], []
         for number in numbers:
-            port = self._nodes[number].port
+            port = self._ingresses[number].port
             period = self._period(port, message_id)
             if period is None:
                 continue
@@ -381,16 +382,16 @@ class Router(Generic[PortT]):
                 outs.append(port)
             else:
                 rate_limited.append((port, period))
-        if len(node.plans) >= MAX_PLANS:
-            node.forget_plans()
+        if len(ingress.plans) >= MAX_PLANS:
+            ingress.forget_plans()
         # Equal tuples become the same object, so that plans can be compared by identity.
-        shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))
+        shared_outs = ingress.destinations.setdefault(tuple(outs), tuple(outs))
         plan = ForwardingPlan(stream_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
-        node.plans[key] = plan
+        ingress.plans[key] = plan
         # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
         # sender's, may change the data about the sender, so `route` must process them.
-        if message_id and sender.port_number == node.number and self._offsets.get(message_id) is None:
-            node.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
+        if message_id and sender.port_number == ingress.number and self._offsets.get(message_id) is None:
+            ingress.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
         return plan
 
     def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:

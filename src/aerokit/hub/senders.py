@@ -50,13 +50,13 @@ class Sender:
     """One component (system id, component id), and the ports at which it was received."""
 
     __slots__ = (
+        "autopilot_ports",
         "component_id",
         "is_autopilot",
         "is_vehicle",
         "port_number",
         "ports",
         "received_at",
-        "reported",
         "source",
         "system_id",
     )
@@ -75,8 +75,8 @@ class Sender:
         self.is_vehicle: bool = False
         """True if its HEARTBEAT is not that of a ground station. Messages for a vehicle go to one port only."""
         self.is_autopilot: bool = False
-        self.reported: set[int] = set()
-        """Ports already known to lead to this autopilot."""
+        self.autopilot_ports: set[int] = set()
+        """Ports at which the sender was received as an autopilot."""
 
     @property
     def destinations(self) -> Iterable[int]:
@@ -113,7 +113,7 @@ class Sender:
 
     def remove_port(self, number: int) -> bool:
         """Forget a port. Return True if the sender is not known at any other port."""
-        self.reported.discard(number)
+        self.autopilot_ports.discard(number)
         self.ports.pop(number, None)
         if self.port_number == number and self.ports:
             self.port_number = max(self.ports, key=self.ports.__getitem__)
@@ -121,24 +121,27 @@ class Sender:
         return not self.ports
 
 
-class RecentFrames:
-    """Recent frames in two generations of `LOOP_WINDOW_S` each. A generation expires as a whole, without a search."""
+FrameRecord = tuple[int, int, float]
+"""Number of the port at which a frame arrived, number of ports created until then, and the time."""
 
-    __slots__ = ("ends_at", "newer", "older")
+
+class RecentFrames:
+    """Recent frames in two tables. Each `LOOP_WINDOW_S`, the older one is dropped as a whole, without a search."""
+
+    __slots__ = ("newer", "older", "rotate_at")
 
     def __init__(self) -> None:
-        # Maps sender, sequence number and checksum (as one number) to a record of the frame: the number of the port at
-        # which it arrived, the number of ports created until then, and the time.
-        self.newer: dict[int, tuple[int, int, float]] = {}
-        self.older: dict[int, tuple[int, int, float]] = {}
-        self.ends_at: float = float("-inf")
-        """End of the current generation."""
+        # The keys are sender, sequence number and checksum as one number.
+        self.newer: dict[int, FrameRecord] = {}
+        self.older: dict[int, FrameRecord] = {}
+        self.rotate_at: float = -math.inf
+        """Time at which to call :meth:`rotate`."""
 
-    def start_generation(self, now: float) -> None:
-        is_expired = now - self.ends_at >= LOOP_WINDOW_S
+    def rotate(self, now: float) -> None:
+        is_expired = now - self.rotate_at >= LOOP_WINDOW_S
         self.older = {} if is_expired else self.newer
         self.newer = {}
-        self.ends_at = now + LOOP_WINDOW_S
+        self.rotate_at = now + LOOP_WINDOW_S
 
 
 REPEAT_EVENT_S = 60.0
@@ -169,7 +172,7 @@ class IdentityGuard:
         """
         if self._routes.arrived_on_other_peer(frame, peer):
             self._current_peer = peer
-            if not self._routes.claims_route(frame, peer, framer.counters_of(frame), is_signed=False):
+            if not self._routes.try_move_route(frame, peer, is_signed=False):
                 return False
         if frame.message_id == 0:  # HEARTBEAT
             self._heartbeat_at[peer] = frame.received_at
@@ -181,7 +184,7 @@ class IdentityGuard:
         self._routes.exclude_pause(now, paused_s)
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Return the first peer without a heartbeat in the last 30 s, and drop its claims to routes."""
+        """Forget the first peer without a heartbeat in the last 30 s, and return it."""
         silent = (peer for peer in peers if now - self._heartbeat_at.get(peer, -math.inf) > PEER_TTL_S)
         return self._routes.evict_idle_peer(silent, now)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import AerokitError, BusyError, LinkLost
 from aerokit.events import DuplicateSender
 from aerokit.hub.message_rules import TargetFields
-from aerokit.hub.port import SigningGateway
+from aerokit.hub.port import FrameSigner
 from aerokit.mavlink.frame import MAGIC_V1, SIGNATURE_LENGTH, Frame
 from aerokit.transport.link import Link, Peer
 
@@ -35,7 +35,7 @@ class SharedLink(Link):
         self._targets = TargetFields(connection.bus.dialect)
         self._receiver: Receiver | None = None  # None while the link is not open
         self._detachments: list[Callable[[], None]] = []  # functions that end the observation of the connection
-        self._gateway: SigningGateway | None = None
+        self._signer: FrameSigner | None = None
         self._loss_report: asyncio.Handle | None = None  # pending call that reports the end of the connection
         self._is_duplicate_reported = False
         self.address: str = f"shared:{connection.link.address}"
@@ -63,8 +63,8 @@ class SharedLink(Link):
             if self._targets.target_of(frame) == self._ids:  # The frame is for this program.
                 continue
             try:
-                gateway = self._current_gateway()
-                signed = raw if gateway is None else gateway.sign(raw, self.connection.unix_time())
+                signer = self._current_signer()
+                signed = raw if signer is None else signer.sign(raw, self.connection.unix_time())
                 if signed is None:
                     self.dropped_writes += 1
                 else:
@@ -98,15 +98,15 @@ class SharedLink(Link):
             self.connection.bus.publish(DuplicateSender(self.connection.now(), *self._ids))
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
-        gateway = self._current_gateway()
+        signer = self._current_signer()
         if self._receiver is not None:
-            unsigned = frame if gateway is None else gateway.strip_signature(frame)
+            unsigned = frame if signer is None else signer.strip_signature(frame)
             self._receiver.bytes_received(unsigned.raw, None)
 
     def _on_sent(self, raw: bytes) -> None:
-        gateway = self._current_gateway()
+        signer = self._current_signer()
         if self._receiver is not None:
-            unsigned = raw if gateway is None else gateway.strip_signature(Frame.parse(raw)).raw
+            unsigned = raw if signer is None else signer.strip_signature(Frame.parse(raw)).raw
             self._receiver.bytes_received(unsigned, None)
 
     def _on_end(self, error: Exception) -> None:
@@ -121,13 +121,13 @@ class SharedLink(Link):
             lost.__cause__ = error
             receiver.link_lost(lost)
 
-    def _current_gateway(self) -> SigningGateway | None:
+    def _current_signer(self) -> FrameSigner | None:
         signing: Signing | None = self.connection.signing
         if signing is None:
-            self._gateway = None
-        elif self._gateway is None or self._gateway.signing is not signing:
-            self._gateway = SigningGateway(signing, self.connection.bus.dialect.extras, _ignore)
-        return self._gateway
+            self._signer = None
+        elif self._signer is None or self._signer.signing is not signing:
+            self._signer = FrameSigner(signing, self.connection.bus.dialect.extras, _ignore)
+        return self._signer
 
 
 def _split_frames(data: bytes) -> Iterator[bytes]:

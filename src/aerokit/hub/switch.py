@@ -41,17 +41,12 @@ class Switch:
     it, otherwise in the next loop iteration.
     """
 
-    def __init__(
-        self,
-        dialect: Dialect,
-        period: Callable[[Port, int], float | None],
-        on_error: Callable[[Port, Exception], object],
-    ) -> None:
+    def __init__(self, dialect: Dialect, on_error: Callable[[Port, Exception], object]) -> None:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
         self._unix_epoch_s = time.time() - self._clock()  # seconds since 1970 at loop time 0
         self._targets = TargetFields(dialect)
-        self.router: Router[Port] = Router(self._targets, period)
+        self.router: Router[Port] = Router(self._targets, lambda port, message_id: port.period(message_id))
         self.router.on_autopilot = _write_single_frames
         self._on_error = on_error
         self._loop_watch = LoopWatch(
@@ -76,13 +71,13 @@ class Switch:
         return self._unix_epoch_s + self._clock()
 
     def add(self, port: Port) -> None:
-        port.node = self.router.add(port)
+        port.ingress = self.router.add(port)
 
     def remove(self, port: Port) -> None:
         self._queueing_ports.pop(port, None)
-        node, port.node = port.node, None
-        if node is not None:
-            self.router.remove(node)
+        ingress, port.ingress = port.ingress, None
+        if ingress is not None:
+            self.router.remove(ingress)
         port.close()
 
     def close(self) -> None:
@@ -119,26 +114,26 @@ class Switch:
         ``data`` is the received bytes. It is None if some of the bytes do not belong to the frames.
         """
         # Hot path: local variables are faster than attributes.
-        node, guard, peer = port.node, port.guard, port.peer
-        if node is None or port.is_read_only:  # `node` is None if the port was removed.
+        ingress, guard, peer = port.ingress, port.guard, port.peer
+        if ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
             if guard is not None:  # The guard still records the ids that each peer uses.
                 for frame in frames:
                     guard.admits(frame, framer, peer)
             port.counters.dropped["read_only"] += len(frames)
             return
         late = framer.late
-        must_check = port.gateway is not None
+        must_check = port.signer is not None
         if guard is not None and not must_check:
             must_check = guard.has_several_peers or _HEARTBEAT_ID in map(_message_id, frames)
         if must_check:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
-            if port.gateway is not None or len(frames) != received_count:
+            if port.signer is not None or len(frames) != received_count:
                 data = None  # The bytes as received are no longer those of the frames to forward.
         if now - arrived_at > ORDER_MAX_AGE_S:
             frames = self._without_commands(port, frames, arrived_at)
             data = None
-        plans = self.router.route_all(node, frames, arrived_at, late)
+        plans = self.router.route_all(ingress, frames, arrived_at, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
@@ -166,9 +161,9 @@ class Switch:
         """Check signatures and ids. Return the accepted frames, and those of them that arrived out of order."""
         admitted: list[Frame] = []
         late: list[Frame] = []
-        gateway, guard, peer = port.gateway, port.guard, port.peer
+        signer, guard, peer = port.signer, port.guard, port.peer
         for received in frames:
-            frame = received if gateway is None else gateway.verify(received, self.unix_time())
+            frame = received if signer is None else signer.verify(received, self.unix_time())
             if frame is None:
                 continue
             # The guard must see every heartbeat. If there is only one peer, its other frames need no check.
@@ -206,7 +201,7 @@ class Switch:
             if not out.batch:
                 self._ports_to_flush.append(out)
             out.batch.append(data)
-            out.joined_frames += len(plans) - 1
+            out.counters.frames_out += len(plans) - 1  # `flush` counts each piece of the batch as one frame.
         return True
 
     def _forward(self, port: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
@@ -223,7 +218,7 @@ class Switch:
             self.recording.write(raw, now)
 
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        if out.node is None:
+        if out.ingress is None:
             return  # The port was removed after the frame was routed.
         if out.must_queue():
             out.enqueue(raw, plan, now)
@@ -238,7 +233,7 @@ class Switch:
 
     def _forward_limited(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         for out, period_s in plan.rate_limited:
-            if out.is_due(plan.key, period_s, now):
+            if out.passes_rate_limit(plan.key, period_s, now):
                 if out.batch:
                     out.batch.append(raw)
                 else:
@@ -256,7 +251,7 @@ class Switch:
                 self._on_error(port, error)
             if port.counters.frames_out > frames_out_before:
                 self._poll_interval_s = MIN_POLL_INTERVAL_S
-            if not port.has_queued_frames:
+            if not port.waiting:
                 self._queueing_ports.pop(port, None)  # The port may have been removed because a write failed.
         if self._queueing_ports:
             self._timer = self._loop.call_later(self._poll_interval_s, self._poll)

@@ -62,8 +62,8 @@ class FrameEncoder:
         ``now`` is in seconds since 1970, for the timestamp of the signature.
 
         Raises:
-            InvalidArgument: a field has an invalid value, or the id is above 255 in MAVLink 1. The sequence number is
-                not increased.
+            InvalidArgument: a field has an invalid value, the id is above 255 in MAVLink 1, or the timestamps of the
+                key are exhausted. The sequence number is not increased.
         """
         signing = self.signing if self._version == 2 else None
         flags = 0 if signing is None else SIGNED
@@ -71,8 +71,9 @@ class FrameEncoder:
         if self._encode_frame is not None:
             compiled: bytes | None = self._encode_frame(message, self._version, flags, self.sequence, *source)
             if compiled is not None:
+                signed = compiled if signing is None else compiled + signing.sign(compiled, now)
                 self.sequence = (self.sequence + 1) & 0xFF
-                return compiled if signing is None else compiled + signing.sign(compiled, now)
+                return signed
             # Compiled code cannot encode this type yet. Make its layout, for the next message.
             layout_of(type(message))
         payload = message.encode()
@@ -90,6 +91,7 @@ class FrameEncoder:
             header = bytes((len(payload), self.sequence, *source, message_id))
             magic = _MAGIC_V1
         body = header + payload
-        self.sequence = (self.sequence + 1) & 0xFF
         frame = magic + body + x25(body + _BYTES[message.CRC_EXTRA]).to_bytes(2, "little")
-        return frame if signing is None else frame + signing.sign(frame, now)
+        signed = frame if signing is None else frame + signing.sign(frame, now)
+        self.sequence = (self.sequence + 1) & 0xFF
+        return signed

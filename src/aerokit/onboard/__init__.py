@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from aerokit.onboard.camera import Photo as Photo
     from aerokit.onboard.camera import Storage as Storage
     from aerokit.onboard.commands import CommandRequest as CommandRequest
-    from aerokit.onboard.commands import CommandResult as CommandResult
     from aerokit.onboard.component import OnboardComponent as OnboardComponent
     from aerokit.onboard.devices import WinchDriver as WinchDriver
     from aerokit.onboard.devices import WinchReport as WinchReport
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from aerokit.onboard.opening import component as component
     from aerokit.onboard.parameters import ComponentParameters as ComponentParameters
     from aerokit.onboard.sources import ComponentSources as ComponentSources
+    from aerokit.protocols.servers.commands import CommandResult as CommandResult
 
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
@@ -36,7 +36,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.onboard.arguments": ("Param", "Range"),
         "aerokit.onboard.autopilot": ("AutopilotDriver",),
         "aerokit.onboard.camera": ("CameraDriver", "Photo", "Storage"),
-        "aerokit.onboard.commands": ("CommandRequest", "CommandResult"),
+        "aerokit.onboard.commands": ("CommandRequest",),
         "aerokit.onboard.component": ("OnboardComponent",),
         "aerokit.onboard.devices": ("WinchDriver", "WinchReport"),
         "aerokit.onboard.gimbal": ("GimbalDriver", "GimbalTarget"),
@@ -45,5 +45,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.onboard.opening": ("component",),
         "aerokit.onboard.parameters": ("ComponentParameters",),
         "aerokit.onboard.sources": ("ComponentSources",),
+        "aerokit.protocols.servers.commands": ("CommandResult",),
     },
 )

@@ -67,13 +67,8 @@ class AutopilotDriver:
         raise NotImplementedError
 
 
-def add_autopilot(
-    services: ComponentServices, driver: AutopilotDriver, set_flight_state: Callable[[bool | None, int | None], None]
-) -> None:
-    """Serve the commands that ground stations send to a vehicle.
-
-    ``set_flight_state(is_armed, custom_mode)`` updates the heartbeat. None leaves a value unchanged.
-    """
+def add_autopilot(services: ComponentServices, driver: AutopilotDriver, set_flight_state: Callable[..., None]) -> None:
+    """Serve the commands that ground stations send to a vehicle. See `OnboardComponent._set_flight_state`."""
 
     async def call(name: str, *arguments: object) -> None:
         if not overrides(driver, AutopilotDriver, name):
@@ -85,13 +80,13 @@ def add_autopilot(
     async def arm_disarm(_: CommandRequest, is_armed: bool, force: float | None) -> None:
         is_forced = force == FORCE or (is_armed and force == FORCE_ARM)
         await call("arm" if is_armed else "disarm", is_forced)
-        set_flight_state(is_armed, None)
+        set_flight_state(is_armed=is_armed)
 
     async def set_mode(_: CommandRequest, base_mode: int, custom_mode: int) -> None:
         if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:  # ArduPilot refuses this, too.
             raise InvalidArgument(f"base_mode = {base_mode} is not allowed: CUSTOM_MODE_ENABLED (1) must be set")
         await call("set_mode", custom_mode)
-        set_flight_state(None, custom_mode)
+        set_flight_state(custom_mode=custom_mode)
 
     async def take_off(request: CommandRequest) -> None:
         *_, altitude_m = request.params

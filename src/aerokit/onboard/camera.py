@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.rotations import quaternion_from_euler
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
     from aerokit.parameters import SettingValue
-    from aerokit.protocols.servers.camera_device import Shot
     from aerokit.protocols.servers.host import ServerHost
 
 
@@ -241,21 +239,21 @@ class CameraAdapter(CameraDevice):
         storage = self._camera.storage()
         return storage is None or (storage.is_ready and storage.available_mib > 0)
 
-    def expose(self, done: Callable[[Shot | None], None]) -> None:
+    def expose(self, done: Callable[[CameraImageCaptured | None], None]) -> None:
         # The picture gets the time of the command, because the camera does not report the time of its shutter.
         time_boot_ms, unix_time = self._host.time_boot_ms, self._host.connection.unix_time()
 
         async def take() -> None:
-            shot = None
+            taken = None
             try:
                 photo = await self._call(self._camera.take_photo, self.captures.image_count)
-                new_shot = _shot(photo, time_boot_ms, unix_time)
-                new_shot(image_index=0, capture_result=1).encode()  # Raises InvalidArgument if a field does not fit.
-                shot = new_shot
+                image = _image_of(photo, time_boot_ms, unix_time)
+                image.encode()  # Raises InvalidArgument if a field does not fit.
+                taken = image
             except Exception as error:
                 self._host.report_error("take_photo", error)
             finally:
-                done(shot)
+                done(taken)
 
         self._tasks.start(take, "aerokit photo")
 
@@ -346,8 +344,7 @@ class CameraAdapter(CameraDevice):
         await self._call(self._camera.reset_settings)
 
 
-def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
-    """Return a function that creates the CAMERA_IMAGE_CAPTURED message of a photo. The caller adds the other fields."""
+def _image_of(photo: Photo, time_boot_ms: int, unix_time: float) -> CameraImageCaptured:
     if not isinstance(photo, Photo):
         raise InvalidArgument(f"take_photo returned {photo!r}, not a Photo")
     position = photo.position
@@ -355,8 +352,7 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
     relative_m = None if position is None else position.altitude_relative_m
     angles = (photo.roll_deg, photo.pitch_deg, photo.yaw_deg)
     known_angles = [math.radians(angle) for angle in angles if angle is not None]
-    message = partial(
-        CameraImageCaptured,
+    return CameraImageCaptured(
         time_boot_ms=time_boot_ms,
         time_utc=round(unix_time * 1e6),
         camera_id=0,
@@ -365,6 +361,7 @@ def _shot(photo: Photo, time_boot_ms: int, unix_time: float) -> Shot:
         alt=0 if amsl_m is None else round(amsl_m * 1000),
         relative_alt=0 if relative_m is None else round(relative_m * 1000),
         q=UNKNOWN_ATTITUDE if len(known_angles) < 3 else quaternion_from_euler(*known_angles),
+        image_index=0,
+        capture_result=1,
+        file_url=photo.url,
     )
-    # A caller can pass `file_url` to replace the URL of the photo.
-    return lambda **fields: message(**{"file_url": photo.url, **fields})

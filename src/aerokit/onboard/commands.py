@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.formatting import short_repr
-from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.missions.item import canonical_frame, command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
-from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, Outcome, RunningCommands
+from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, CommandResult, RunningCommands
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,17 +27,9 @@ if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
+    from aerokit.protocols.servers.host import ComponentIds
 
 MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # Two more for a series of pictures and the check of an upload.
-
-
-class CommandResult(Snapshot):
-    """Result of a command handler: a MAV_RESULT, and two numbers whose meaning depends on the command."""
-
-    result: int = MavResult.ACCEPTED.value
-    progress: int = 0
-    detail: int = 0
-    """``result_param2`` of COMMAND_ACK."""
 
 
 @checks_arguments
@@ -54,7 +45,7 @@ class CommandRequest:
         return self._command.command
 
     @property
-    def sender(self) -> tuple[int, int]:
+    def sender(self) -> ComponentIds:
         """System id and component id of the sender."""
         return self._command.sender
 
@@ -92,24 +83,23 @@ class CommandRequest:
         self._report(percent)
 
     def __repr__(self) -> str:
-        system_id, component_id = self.sender
-        return f"<CommandRequest {command_name(self.command)} from {system_id}/{component_id}>"
+        return f"<CommandRequest {command_name(self.command)} from {self.sender.system}/{self.sender.component}>"
 
 
-def outcome_of(value: object) -> Outcome:
+def command_result(value: object) -> CommandResult:
     """Convert the return value of a handler. Raise TypeError if COMMAND_ACK cannot carry it."""
     if value is None or value is True:
-        return Outcome(MavResult.ACCEPTED)
-    outcome = Outcome(MavResult.FAILED)
+        return CommandResult()
+    result = CommandResult(MavResult.FAILED)
     if isinstance(value, CommandResult):
-        outcome = Outcome(value.result, progress=value.progress, detail=value.detail)
+        result = value
     elif isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
-        outcome = Outcome(int(value))
+        result = CommandResult(int(value))
     try:
-        CommandAck(0, *outcome).encode()
+        CommandAck(0, result.result, result.progress, result.detail).encode()
     except InvalidArgument as error:
         raise TypeError(f"the function returned {short_repr(value)}, which is no result: {error}") from None
-    return outcome
+    return result
 
 
 def overrides(driver: object, base: type, name: str) -> bool:
@@ -163,9 +153,9 @@ class ComponentCommands:
             self._execute(function, arguments, received, is_stop=is_stop(received))
 
         arguments = arguments_of(function)
-        self.add_handlers({command: execute})
+        self._register({command: execute})
 
-    def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
+    def _register(self, handlers: Mapping[int, CommandHandler]) -> None:
         """Register handlers that check the parameters themselves.
 
         Raises InvalidArgument if a command already has a handler.
@@ -188,7 +178,7 @@ class ComponentCommands:
 
             return guarded
 
-        self.add_handlers({command: guard(handler) for command, handler in handlers.items()})
+        self._register({command: guard(handler) for command, handler in handlers.items()})
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function of the program, and wait for its result.
@@ -228,7 +218,7 @@ class ComponentCommands:
         async def run(request: CommandRequest) -> int:
             return await function(request._command)
 
-        self.add_handlers({command: partial(self._execute, run, ())})
+        self._register({command: partial(self._execute, run, ())})
 
     def cancel_all(self) -> None:
         self._running.cancel_all()
@@ -247,73 +237,78 @@ class ComponentCommands:
         *,
         is_stop: bool = False,
     ) -> None:
-        task: asyncio.Task[Any] | None = None
-        is_cancelled = False
+        execution = _Execution(self, function)
+        running = self._running.start(command, execution.cancel, is_stop=is_stop)
+        if running is not None:  # Otherwise start() has answered: it is a repetition, or another command is running.
+            execution.begin(running, arguments)
 
-        # `cancel` is called after this method has returned, when `returned` and `running` below are set.
-        def cancel() -> bool:
-            nonlocal is_cancelled
-            if task in self._tasks_in_threads:
-                return False  # The command cannot be cancelled. Its sender gets the result.
-            if task is not None:
-                task.cancel()
-            elif not is_cancelled:  # The task has not started yet.
-                is_cancelled = True
-                if inspect.iscoroutine(returned):
-                    returned.close()
-                self._running.finish(running, Outcome(MavResult.CANCELLED))
-            return True
 
-        started = self._running.start(command, cancel, is_stop=is_stop)
-        if started is None:  # start() has answered already: the command is a repetition, or another command is running.
-            return
-        running = started  # Unlike `started`, this is never None, which type checkers require in the closures.
-        loop = asyncio.get_running_loop() if self.uses_threads else None
+class _Execution:
+    """One execution of a command handler, as a task if the handler returns an awaitable."""
 
-        def report(percent: int) -> None:
-            if loop is None:
-                self._running.report(running, percent)
-            else:  # The handler may run in a thread, which must not call the event loop's objects directly.
-                loop.call_soon_threadsafe(self._running.report, running, percent)
+    _running: RunningCommand
+    _returned: Any  # what the handler has returned
 
-        request = CommandRequest(command, report)
+    def __init__(self, commands: ComponentCommands, function: Callable[..., Any]) -> None:
+        self._commands, self._function = commands, function
+        self._loop = asyncio.get_running_loop()
+        self._task: asyncio.Task[Any] | None = None  # None before the task has started
+        self._is_cancelled = False  # True if cancelled before the task has started
+
+    def begin(self, running: RunningCommand, arguments: tuple[CommandArgument, ...]) -> None:
+        self._running = running
+        request = CommandRequest(running.command, self._report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            returned = self.begin(function, request, *values)
-            outcome = None if inspect.isawaitable(returned) else outcome_of(returned)
+            self._returned = self._commands.begin(self._function, request, *values)
+            result = None if inspect.isawaitable(self._returned) else command_result(self._returned)
         except Exception as error:
-            self._finish_with_error(running, function, error)
+            self._finish_with_error(error)
             return
-        if outcome is not None:
-            self._running.finish(running, outcome)
+        if result is not None:
+            self._finish(result)
+        elif self._commands._tasks.start(self._run, f"aerokit {command_name(running.command.command)}") is None:
+            self.cancel()  # The component is closing.
+
+    def cancel(self) -> bool:
+        """Cancel the handler. Return False if it runs in a thread, which cannot be cancelled."""
+        if self._task in self._commands._tasks_in_threads:
+            return False  # The sender gets the result.
+        if self._task is not None:
+            self._task.cancel()
+        elif not self._is_cancelled:
+            self._is_cancelled = True
+            if inspect.iscoroutine(self._returned):
+                self._returned.close()
+            self._finish(CommandResult(MavResult.CANCELLED))
+        return True
+
+    async def _run(self) -> None:
+        if self._is_cancelled:
             return
-
-        async def run() -> None:
-            nonlocal task
-            if is_cancelled:
-                return
-            task = asyncio.current_task()
-            await self._finish_when_done(running, function, returned)
-
-        if self._tasks.start(run, f"aerokit {command_name(command.command)}") is None:  # The component is closing.
-            cancel()
-
-    async def _finish_when_done(
-        self, running: RunningCommand, function: Callable[..., Any], returned: Awaitable[Any]
-    ) -> None:
+        self._task = asyncio.current_task()
         try:
-            outcome = outcome_of(await returned)
+            result = command_result(await self._returned)
         except asyncio.CancelledError:
-            self._running.finish(running, Outcome(MavResult.CANCELLED))
+            self._finish(CommandResult(MavResult.CANCELLED))
             raise
         except Exception as error:
-            self._finish_with_error(running, function, error)
+            self._finish_with_error(error)
         else:
-            self._running.finish(running, outcome)
+            self._finish(result)
 
-    def _finish_with_error(self, running: RunningCommand, function: Callable[..., Any], error: Exception) -> None:
-        name = getattr(function, "__name__", "run")
+    def _report(self, percent: int) -> None:
+        if self._commands.uses_threads:  # A thread must not call the event loop's objects directly.
+            self._loop.call_soon_threadsafe(self._commands._running.report, self._running, percent)
+        else:
+            self._commands._running.report(self._running, percent)
+
+    def _finish(self, result: CommandResult) -> None:
+        self._commands._running.finish(self._running, result)
+
+    def _finish_with_error(self, error: Exception) -> None:
+        name = getattr(self._function, "__name__", "run")
         if name == "run":  # The name of aerokit's own wrapper tells the sender nothing.
-            name = command_name(running.command.command)
-        self._host.report_error(name, error)
-        self._running.finish(running, Outcome(result_of(error)))
+            name = command_name(self._running.command.command)
+        self._commands._host.report_error(name, error)
+        self._finish(CommandResult(result_of(error)))

@@ -329,7 +329,7 @@ class OnboardComponent:
 
         add_autopilot(self._services, driver, self._set_flight_state)
 
-    def _set_flight_state(self, is_armed: bool | None, custom_mode: int | None) -> None:
+    def _set_flight_state(self, *, is_armed: bool | None = None, custom_mode: int | None = None) -> None:
         """Change the armed state or the mode in the heartbeat; None leaves it unchanged."""
         old = self._heartbeat
         flags = old.base_mode | MavModeFlag.CUSTOM_MODE_ENABLED

@@ -11,8 +11,9 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavArmAuthDeniedReason, MavCmd, MavResult, MavSeverity, WinchActions
-from aerokit.onboard.commands import CommandResult, overrides, result_of
+from aerokit.onboard.commands import overrides, result_of
 from aerokit.onboard.host import error_text
+from aerokit.protocols.servers.commands import CommandResult
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
@@ -132,10 +133,10 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
             raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
         if method == "set_rate":
             can_hold = overrides(winch, WinchDriver, "hold")
-            services.motions["winch"] = winch.hold if can_hold else partial(winch.set_rate, 0.0)
+            services.stop_functions["winch"] = winch.hold if can_hold else partial(winch.set_rate, 0.0)
         await services.commands.call(getattr(winch, method), *arguments)
         if method != "set_rate" or rate == 0:
-            services.motions.pop("winch", None)
+            services.stop_functions.pop("winch", None)
 
     def status() -> m.WinchStatus:
         report = winch.report()
@@ -173,10 +174,9 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
     """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
-        sender_system, _ = request.sender
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).
-            answer = await services.commands.call(authorize, system_id or sender_system)
+            answer = await services.commands.call(authorize, system_id or request.sender.system)
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavSeverity
-from aerokit.protocols.servers.host import Channel
 
 if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
+    from aerokit.protocols.servers.host import ComponentIds
 
 MAX_STORED_EVENTS = 64
 SEQUENCE_INTERVAL_S = 5.0
@@ -63,7 +63,7 @@ class EventSender:
         self._host.send(m.CurrentEventSequence(self._sequence, flags=0))
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
-    def _on_request(self, request: m.RequestEvent, sender: Channel) -> None:
+    def _on_request(self, request: m.RequestEvent, sender: ComponentIds) -> None:
         # Sequence numbers have 16 bits and wrap around, so `last_sequence` may be below `first_sequence`.
         count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
         stored = [event for event in self._sent if (event.sequence - request.first_sequence) & 0xFFFF < count]
@@ -71,28 +71,21 @@ class EventSender:
             self._host.send(event, sender)
         if not stored:
             oldest = self._sent[0].sequence if self._sent else 0
-            system, component = sender
-            error = m.ResponseEventError(system, component, request.first_sequence, oldest, reason=_UNAVAILABLE)
+            error = m.ResponseEventError(*sender, request.first_sequence, oldest, reason=_UNAVAILABLE)
             self._host.send(error, sender)
 
 
 def answer_pings(host: ComponentHost) -> None:
     """Answer PING and TIMESYNC requests."""
 
-    def on_ping(ping: m.Ping, sender: Channel) -> None:
+    def on_ping(ping: m.Ping, sender: ComponentIds) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # A PING with a target is an answer.
-            sender_system, sender_component = sender
-            answer = m.Ping(ping.time_usec, ping.seq, target_system=sender_system, target_component=sender_component)
-            host.send(answer, sender)
+            host.send(m.Ping(ping.time_usec, ping.seq, *sender), sender)
 
-    def on_timesync(message: m.Timesync, sender: Channel) -> None:
+    def on_timesync(message: m.Timesync, sender: ComponentIds) -> None:
         if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
             own_time_ns = int(host.now * 1e9)
-            sender_system, sender_component = sender
-            answer = m.Timesync(
-                tc1=own_time_ns, ts1=message.ts1, target_system=sender_system, target_component=sender_component
-            )
-            host.send(answer, sender)
+            host.send(m.Timesync(own_time_ns, message.ts1, *sender), sender)
 
     host.on(m.Ping, on_ping)
     host.on(m.Timesync, on_timesync)

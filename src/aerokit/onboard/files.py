@@ -139,7 +139,7 @@ class DirectoryFiles:
                     raise
         if self._root is None or path in self._memory:  # If only memory is served, this raises for an unknown path.
             sizes.update(self._memory.entries(path))
-        return sorted(sizes.items())
+        return [Entry(name, size) for name, size in sorted(sizes.items())]
 
     @_raises_file_fault
     def truncate(self, path: str, size: int) -> None:

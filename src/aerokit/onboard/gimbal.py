@@ -117,7 +117,7 @@ class GimbalAdapter(GimbalMount):
                 self.capabilities &= ~axis_flags
         if yaw == _FULL_TURN_DEG:
             self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
-        self._gimbal, self._host, self._motions = gimbal, services.host, services.motions
+        self._gimbal, self._host, self._stop_functions = gimbal, services.host, services.stop_functions
         self._is_yaw_locked = False
         self._followed_system_id = 0  # system at which the gimbal points; 0 if there is none
 
@@ -157,7 +157,7 @@ class GimbalAdapter(GimbalMount):
         roll, pitch, yaw = (math.degrees(max(-limit, min(limit, rate))) for rate in rates)
         self._apply(GimbalTarget(angles=None, rates=(roll, pitch, yaw), yaw_locked=locked), flags)
         if any(rates):
-            self._motions["gimbal"] = self._stop
+            self._stop_functions["gimbal"] = self._stop
 
     async def _stop(self) -> None:  # A coroutine function, because plain functions may be called in a thread.
         self._gimbal.point(GimbalTarget(angles=None, rates=(0.0, 0.0, 0.0), yaw_locked=self._is_yaw_locked))
@@ -168,17 +168,15 @@ class GimbalAdapter(GimbalMount):
 
     def _record(self, flags: int, *, is_yaw_locked: bool) -> None:
         # The motion is forgotten only here: if the program's method raised an exception, the gimbal may still turn.
-        self._motions.pop("gimbal", None)
+        self._stop_functions.pop("gimbal", None)
         self.flags: int = flags
         self._is_yaw_locked = is_yaw_locked
         self._followed_system_id = 0  # A newer command ends the following.
 
     def look_at(self, place: Place | None) -> None:
-        if place is None:
-            position = None
-        else:
-            latitude_e7, longitude_e7, altitude_amsl_m = place
-            position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
+        position = None
+        if place is not None:
+            position = Position(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, altitude_amsl_m=place.altitude_m)
         self._gimbal.look_at(position)
         # While the gimbal looks at a position, turns of the vehicle do not turn the gimbal.
         self._record(0, is_yaw_locked=position is not None)

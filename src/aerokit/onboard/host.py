@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
     from aerokit.connection.connection import Connection
     from aerokit.mavlink.message import Message
-    from aerokit.protocols.servers.host import Channel, Handler
+    from aerokit.protocols.servers.host import ComponentIds, Handler
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -81,11 +81,10 @@ class ComponentHost:
 
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
 
-    def _is_addressed(self, message: Message, sender: tuple[int, int]) -> bool:
-        sender_system, _ = sender
-        if sender == (self.system_id, self.component_id) or sender_system == 0:  # System id 0 is not a valid sender.
+    def _is_addressed(self, message: Message, sender: ComponentIds) -> bool:
+        if sender == (self.system_id, self.component_id) or sender.system == 0:  # System id 0 is not a valid sender.
             return False
-        if self._accepts is not None and sender_system not in self._accepts:
+        if self._accepts is not None and sender.system not in self._accepts:
             return False
         # A message without target fields is for all systems and components (0).
         target_system = getattr(message, "target_system", 0)
@@ -106,16 +105,14 @@ class ComponentHost:
         logger.warning("component %d/%d: %s that may be %.0f s old was not executed", *ids, message.NAME, age_s)
         return True
 
-    def send(self, message: Message, channel: Channel = None) -> None:
+    def send(self, message: Message, channel: ComponentIds | None = None) -> None:
         """Send a message to the system of ``channel``; None means all systems.
 
         Does nothing after the end of the connection.
         """
         if self._is_closed or not self.connection.is_open:
             return
-        to = None
-        if channel is not None:
-            to, _ = channel
+        to = None if channel is None else channel.system
         if self._encoder is None:
             self.connection.send(message, to=to)
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -60,14 +60,20 @@ class Identity(Snapshot):
         return major << 24 | minor << 16 | patch << 8 | release_type
 
 
+class MetadataFile(NamedTuple):
+    """A metadata file. ``content()`` is called again for each COMPONENT_METADATA."""
+
+    path: str
+    content: Callable[[], bytes]
+
+
 class IdentityMessages:
     """Builds the messages that identify a component, and writes its metadata files."""
 
     def __init__(self, host: ComponentHost, identity: Identity, memory: FileTree) -> None:
         self.capabilities: int = int(Capability.MAVLINK2 | Capability.COMMAND_INT)
         """MAV_PROTOCOL_CAPABILITY of the protocols that are served."""
-        self.metadata: dict[int, tuple[str, Callable[[], bytes]]] = {}
-        """Maps COMP_METADATA_TYPE to path and content of a metadata file."""
+        self._metadata_files: dict[int, MetadataFile] = {}  # by COMP_METADATA_TYPE
         self._host, self._identity, self._memory = host, identity, memory
 
     def builders(self) -> dict[int, Builder]:
@@ -109,22 +115,21 @@ class IdentityMessages:
     def update_files(self) -> int:
         """Write the metadata files; return the checksum of the general metadata file."""
         entries = []
-        for kind, (path, content) in self.metadata.items():
-            data = content()
-            self._memory.put(path, data)
-            entries.append({"type": kind, "uri": f"mftp://{path}", "fileCrc": crc32(data)})
+        for kind, file in self._metadata_files.items():
+            data = file.content()
+            self._memory.put(file.path, data)
+            entries.append({"type": kind, "uri": f"mftp://{file.path}", "fileCrc": crc32(data)})
         general = json.dumps({"version": 1, "metadataTypes": entries}).encode()
         self._memory.put(GENERAL_PATH, general)
         return crc32(general)
 
     def _metadata(self, _: ReceivedCommand | None) -> Iterable[Message]:
-        if not self.metadata:
+        if not self._metadata_files:
             return []
         checksum = self.update_files()
         uri = f"mftp://{GENERAL_PATH}"
         return [m.ComponentMetadata(time_boot_ms=self._host.time_boot_ms, file_crc=checksum, uri=uri)]
 
     def add_metadata(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
-        """Serve a metadata file. ``content()`` is called again for each COMPONENT_METADATA."""
-        self.metadata[kind] = (path, content)
+        self._metadata_files[kind] = MetadataFile(path, content)
         self.update_files()

@@ -17,7 +17,12 @@ from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamError, MavParamExtType, MavSeverity, ParamAck
 from aerokit.parameters import ParameterMetadata, check_name
 from aerokit.parameters.parameter import checked_setting, settings_equal, to_float32
-from aerokit.protocols.servers.parameters import TypedExtendedServer, TypedParameterServer, fits_param_value
+from aerokit.protocols.servers.parameters import (
+    ParameterRefusal,
+    TypedExtendedServer,
+    TypedParameterServer,
+    fits_param_value,
+)
 
 if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
@@ -252,7 +257,7 @@ class _Store:
         return tuple(self._parameters._rows)
 
     @property
-    def small_names(self) -> list[str]:
+    def param_names(self) -> list[str]:
         return self._parameters._numeric_names
 
     def __contains__(self, name: object) -> bool:
@@ -264,23 +269,22 @@ class _Store:
     def type(self, name: str) -> MavParamExtType:
         return self._parameters._rows[name].type
 
-    def problem(self, name: str, value: object, type: int) -> tuple[int, int] | None:  # noqa: A002
-        """Return None if a value is accepted, otherwise the MAV_PARAM_ERROR and the PARAM_ACK for it."""
+    def refusal(self, name: str, value: object, type: int) -> ParameterRefusal | None:  # noqa: A002
         row = self._parameters._rows[name]
         if row.metadata.read_only:
-            return MavParamError.READ_ONLY, ParamAck.FAILED
+            return ParameterRefusal(MavParamError.READ_ONLY, ParamAck.FAILED)
         if type != row.type:
-            return MavParamError.TYPE_MISMATCH, ParamAck.VALUE_UNSUPPORTED
+            return ParameterRefusal(MavParamError.TYPE_MISMATCH, ParamAck.VALUE_UNSUPPORTED)
         try:
             checked = self._parameters._checked(row, value)
             if row.on_set is not None:
                 row.on_set(checked)  # The program's function refuses a value by an exception.
         except InvalidArgument as error:
             self._parameters._host.send_text(MavSeverity.WARNING, str(error))
-            return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED
+            return ParameterRefusal(MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED)
         except Exception as error:
             self._parameters._host.report_error(name, error)
-            return MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED
+            return ParameterRefusal(MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED)
         return None
 
     def store(self, name: str, value: object) -> None:

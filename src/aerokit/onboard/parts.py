@@ -13,7 +13,6 @@ from aerokit.onboard.camera import CameraAdapter, CameraDriver
 from aerokit.onboard.commands import overrides
 from aerokit.onboard.gimbal import STATUS_INTERVAL_S, GimbalAdapter, GimbalDriver
 from aerokit.parameters import parse_definition
-from aerokit.parameters.parameter import setting_bytes
 from aerokit.protocols.servers.camera import camera_builders
 from aerokit.protocols.servers.camera_commands import camera_commands, legacy_requests
 from aerokit.protocols.servers.definitions import DefinedParameterServer
@@ -39,16 +38,14 @@ class DefinedSettings(DefinedParameterServer):
         super().__init__(host, definition)
         self._component = host
 
-    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        old_value = self.values.get(name)
+    def set(self, name: str, data: bytes, kind: int) -> int:
+        old_value = self.values[name]
         try:
             return super().set(name, data, kind)
-        except Exception as error:
-            assert old_value is not None  # The program's function has refused the new value.
+        except Exception as error:  # The program's function has refused the new value.
             self.values[name] = old_value
             self._component.report_error(name, error)
-            wire_type = self.definition.settings[name].wire_type
-            return ParamAck.FAILED, setting_bytes(old_value, wire_type), wire_type
+            return ParamAck.FAILED
 
     def on_set(self, name: str, value: SettingValue) -> None:
         self._on_change(name, value)

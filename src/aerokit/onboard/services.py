@@ -40,20 +40,20 @@ class ComponentServices:
         )
         self.commands.add_guarded(self.streams.commands())
         self.memory: FileTree = FileTree()
-        self.motions: dict[str, Callable[[], Any]] = {}
-        """Motions that go on until the next command: the program's function that stops each, by the part's name."""
+        self.stop_functions: dict[str, Callable[[], Any]] = {}
+        """Functions of the program that stop a motion, by the name of the part that moves until the next command."""
 
     async def stop_motions(self) -> None:
         thread_calls = set(self.commands.thread_calls)
-        motions = dict(self.motions)
-        self.motions.clear()
-        await self._call_all(motions)
-        if motions and thread_calls:  # One of these threads may have started the motion again.
+        stop_functions = dict(self.stop_functions)
+        self.stop_functions.clear()
+        await self._call_all(stop_functions)
+        if stop_functions and thread_calls:  # One of these threads may have started the motion again.
             await asyncio.wait(thread_calls, timeout=STOP_TIMEOUT_S)
-            await self._call_all(motions)
+            await self._call_all(stop_functions)
 
-    async def _call_all(self, motions: Mapping[str, Callable[[], Any]]) -> None:
-        for part, stop in motions.items():
+    async def _call_all(self, stop_functions: Mapping[str, Callable[[], Any]]) -> None:
+        for part, stop in stop_functions.items():
             try:
                 with anyio.fail_after(STOP_TIMEOUT_S):
                     await self.commands.call(stop)

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.files import MAX_FILE_SIZE, decompress, file_too_large, read_bounded
 from aerokit._internal.formatting import did_you_mean, short_repr
@@ -143,8 +143,8 @@ class CameraDefinition(Snapshot):
                 for restriction in option.ranges:
                     if restriction.setting == name:
                         names.append(setting.name)
-                        tested = [tested_name for tested_name, *_ in _parse_condition(restriction.condition)]
-                        names += [tested_name for tested_name in tested if tested_name in self.settings]
+                        tests = _parse_condition(restriction.condition)
+                        names += [test.setting for test in tests if test.setting in self.settings]
         unique_names = dict.fromkeys(names)
         return tuple(dependency for dependency in unique_names if dependency != name)
 
@@ -302,13 +302,15 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
 # -------------------------------------------------------------------------------------- conditions
 
 
-def _parse_condition(condition: str) -> list[tuple[str, str, str, str]]:
-    """Parse a condition into tests of the form (setting, operator, value, joiner).
+class _Test(NamedTuple):
+    setting: str
+    operator: str
+    value: str
+    joiner: str  # "AND" or "OR": combines the test with the result of all tests before it
 
-    The joiner, "AND" or "OR", combines a test with the result of all tests before it.
 
-    Raises ValueError if the condition is malformed.
-    """
+def _parse_condition(condition: str) -> list[_Test]:
+    """Parse a condition. Raises ValueError if it is malformed."""
     if not condition:
         return []
     tests = []
@@ -323,7 +325,7 @@ def _parse_condition(condition: str) -> list[tuple[str, str, str, str]]:
         if operator is None:
             raise ValueError(f"{condition!r} is not a condition")
         name, _, value = text.partition(operator)
-        tests.append((name.strip(), operator, value.strip(), joiner))
+        tests.append(_Test(name.strip(), operator, value.strip(), joiner))
         joiner, words = word, []
     return tests
 
@@ -331,9 +333,9 @@ def _parse_condition(condition: str) -> list[tuple[str, str, str, str]]:
 def _evaluate(condition: str, values: Values) -> bool:
     """Evaluate a condition from left to right. A test of an unknown setting is False."""
     result = True
-    for name, operator, value, joiner in _parse_condition(condition):
-        is_true = name in values and _compare(values[name], operator, value)
-        result = (result and is_true) if joiner == "AND" else (result or is_true)
+    for test in _parse_condition(condition):
+        is_true = test.setting in values and _compare(values[test.setting], test.operator, test.value)
+        result = (result and is_true) if test.joiner == "AND" else (result or is_true)
     return result
 
 

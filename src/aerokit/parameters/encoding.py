@@ -51,34 +51,15 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
     return _FORMATS[type].pack(value).ljust(4, b"\0")
 
 
-def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode the four bytes of ``param_value``.
-
-    Never raises. A fraction or NaN that a vehicle sends for an integer type is returned as a float.
-    """
-    if bytewise and type in _FORMATS:
-        return int(_FORMATS[type].unpack_from(bits)[0])
-    return _cast(_FLOAT.unpack(bits)[0], type)
-
-
-def to_wire(value: float, type: ParameterType, bytewise: bool) -> float:  # noqa: A002
-    """Encode a value as ``param_value``. Inexact for a signalling NaN: use :func:`set_message` to send a value."""
-    return float(_FLOAT.unpack(to_bits(value, type, bytewise))[0])
-
-
-def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode a ``param_value``. Inexact for a signalling NaN: use :func:`value_of` for a received message."""
-    if bytewise and type in _FORMATS:
-        return from_bits(_FLOAT.pack(param_value), type, bytewise)
-    return _cast(param_value, type)
-
-
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
-    """Return the value in a PARAM_VALUE, exact to the bit if the message was received."""
+    """Return the value in a PARAM_VALUE, exact to the bit if the message was received.
+
+    A fraction or NaN that a vehicle sends for an integer type is returned as a float.
+    """
     type_ = ParameterType.from_wire(message.param_type)
-    if not bytewise or not math.isnan(message.param_value):
-        return from_wire(message.param_value, type_, bytewise)
-    return from_bits(_exact_bits(message), type_, bytewise)
+    if bytewise and type_ in _FORMATS:
+        return int(_FORMATS[type_].unpack_from(_exact_bits(message))[0])
+    return _cast(message.param_value, type_)
 
 
 def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:

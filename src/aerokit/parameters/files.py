@@ -9,8 +9,8 @@ refused as a whole, because half a set of parameters is worse than no parameters
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Literal
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Literal, NamedTuple
 
 from aerokit._internal.files import read_bounded, write_atomically
 from aerokit.errors import FileFormatError, InvalidArgument
@@ -87,16 +87,16 @@ def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | Non
 def parse_parameter_file(text: str, source: str = "parameters", *, component_id: int | None = None) -> ParameterFile:
     """Parse the text of a parameter file. Error texts begin with ``source``."""
     comments: list[str] = []
-    lines: list[tuple[str, str]] = []
+    lines: list[_Line] = []
     for number, line in enumerate(text.splitlines(), 1):
         content, hash_sign, comment = line.partition("#")
         if content.strip():
-            lines.append((f"{source}, line {number}", content))
+            lines.append(_Line(f"{source}, line {number}", content))
         elif hash_sign:
             comments.append(comment.strip())
     if not lines:
         raise FileFormatError(f"{source} contains no parameters")
-    _, first_line = lines[0]
+    first_line = lines[0].text
     if "\t" in first_line and len(first_line.split()) > 2:  # The other formats have only name and value.
         return _parse_qgroundcontrol(lines, comments, source, component_id)
     return _parse_names_and_values(lines, comments)
@@ -154,50 +154,53 @@ def parameter_file_text(
 # --------------------------------------------------------------------------------------- reading
 
 
-def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -> ParameterFile:
-    """Parse a file of Mission Planner or MAVProxy. ``lines`` has (place, text) pairs."""
-    values: dict[str, int | float] = {}
-    places: dict[str, str] = {}
-    for place, line in lines:
-        fields = line.replace(",", " ").split()
+class _Line(NamedTuple):
+    place: str  # for error texts
+    text: str
+
+
+class _Row(NamedTuple):
+    """A line of a QGroundControl file."""
+
+    component_id: int
+    name: str
+    value: str
+    type: ParameterType
+
+
+def _parse_names_and_values(lines: list[_Line], comments: list[str]) -> ParameterFile:
+    """Parse a file of Mission Planner or MAVProxy."""
+    file = ParameterFile({}, format="missionplanner" if "," in lines[0].text else "mavproxy", comments=comments)
+    for line in lines:
+        fields = line.text.replace(",", " ").split()
         if len(fields) != 2:
             hint = _directive_hint(fields)
-            raise FileFormatError(f"{place}: {line.strip()!r} is not NAME,VALUE or NAME VALUE{hint}")
+            raise FileFormatError(f"{line.place}: {line.text.strip()!r} is not NAME,VALUE or NAME VALUE{hint}")
         name, value_text = fields
-        _add_value(values, place, name, value_text, ParameterType.REAL32)
-        places[name] = place
-    _, first_line = lines[0]
-    file_format: FileFormat = "missionplanner" if "," in first_line else "mavproxy"
-    return ParameterFile(values, format=file_format, comments=comments, places=places)
+        _add_value(file, line.place, name, value_text, ParameterType.REAL32)
+    return file
 
 
 def _parse_qgroundcontrol(
-    lines: list[tuple[str, str]], comments: list[str], source: str, component_id: int | None
+    lines: list[_Line], comments: list[str], source: str, component_id: int | None
 ) -> ParameterFile:
     """Parse a file of QGroundControl, and return the parameters of one component."""
-    values: dict[int, dict[str, int | float]] = {}
-    types: dict[int, dict[str, ParameterType]] = {}
-    places: dict[int, dict[str, str]] = {}
-    for place, line in lines:
-        component, name, text, kind = _parse_columns(place, line)
-        _add_value(values.setdefault(component, {}), place, name, text, kind)
-        types.setdefault(component, {})[name] = kind
-        places.setdefault(component, {})[name] = place
-    selected = _select_component(component_id, values, source)
-    return ParameterFile(
-        values[selected],
-        format="qgroundcontrol",
-        types=types[selected],
-        comments=comments,
-        component_id=selected,
-        places=places[selected],
-    )
+    components: dict[int, ParameterFile] = {}
+    for line in lines:
+        row = _parse_columns(line)
+        if row.component_id not in components:
+            components[row.component_id] = ParameterFile(
+                {}, format="qgroundcontrol", comments=comments, component_id=row.component_id
+            )
+        file = components[row.component_id]
+        _add_value(file, line.place, row.name, row.value, row.type)
+        file.types[row.name] = row.type
+    return components[_select_component(component_id, components, source)]
 
 
-def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]:
-    """Split a line of a QGroundControl file into component id, name, value as text, and type."""
-    fields = line.strip().split("\t")
-    error = FileFormatError(f"{place}: {line.strip()!r} is not {_COLUMNS}")
+def _parse_columns(line: _Line) -> _Row:
+    fields = line.text.strip().split("\t")
+    error = FileFormatError(f"{line.place}: {line.text.strip()!r} is not {_COLUMNS}")
     if len(fields) != 5:
         raise error
     system_id, component_id, name, value, type_number = fields
@@ -206,25 +209,25 @@ def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]
         raise error
     kind = int(type_number)
     if not 1 <= kind <= 10:
-        raise FileFormatError(f"{place}: type {kind} is not a MAV_PARAM_TYPE (1 to 10)")
-    return int(component_id), name.strip(), value.strip(), ParameterType(kind)
+        raise FileFormatError(f"{line.place}: type {kind} is not a MAV_PARAM_TYPE (1 to 10)")
+    return _Row(int(component_id), name.strip(), value.strip(), ParameterType(kind))
 
 
-def _select_component(requested: int | None, values: Mapping[int, object], source: str) -> int:
+def _select_component(requested: int | None, components: Collection[int], source: str) -> int:
     """Return the requested component, by default the autopilot or the only one."""
-    if requested is not None and requested in values:
+    if requested is not None and requested in components:
         return requested
-    if requested is None and _AUTOPILOT in values:
+    if requested is None and _AUTOPILOT in components:
         return _AUTOPILOT
-    if requested is None and len(values) == 1:
-        return next(iter(values))
-    present = ", ".join(str(component) for component in sorted(values))
+    if requested is None and len(components) == 1:
+        return next(iter(components))
+    present = ", ".join(str(component) for component in sorted(components))
     if requested is None:
         raise FileFormatError(f"{source} has several components: {present}; select one with component_id")
     raise FileFormatError(f"{source} has no parameters of component {requested}, only of: {present}")
 
 
-def _add_value(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
+def _add_value(file: ParameterFile, place: str, name: str, text: str, kind: ParameterType) -> None:
     """Add a parameter. Raises FileFormatError for an invalid value or a repeated name."""
     try:
         number = parse_number(text)
@@ -234,9 +237,10 @@ def _add_value(values: dict[str, int | float], place: str, name: str, text: str,
         checked = checked_value(check_name(name), number, kind)
     except InvalidArgument as error:
         raise FileFormatError(f"{place}: {error}") from None
-    if name in values:
+    if name in file:
         raise FileFormatError(f"{place}: {name} appears a second time")
-    values[name] = checked if kind.is_integer else number  # A float keeps all its digits, as in the file.
+    file._values[name] = checked if kind.is_integer else number  # A float keeps all its digits, as in the file.
+    file.places[name] = place
 
 
 def _directive_hint(fields: list[str]) -> str:

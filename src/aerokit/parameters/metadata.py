@@ -170,7 +170,6 @@ _BITS = range(64)
 
 
 def _parse(data: bytes) -> list[ParameterMetadata]:
-    """Parse a metadata file of ArduPilot or PX4, XML or JSON."""
     byte_order_mark = b"\xef\xbb\xbf"
     if data.lstrip(byte_order_mark + b" \t\r\n").startswith(b"<"):
         root = DefusedXml.fromstring(data, forbid_dtd=True)
@@ -189,7 +188,6 @@ def _parse(data: bytes) -> list[ParameterMetadata]:
 
 # ------------------------------------------------------------------------------------- ArduPilot
 def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
-    """Yield the parameters of an apm.pdef.xml."""
     for group in root.iter("parameters"):
         for param in group.iter("param"):
             fields = {field.get("name", ""): field.text or "" for field in param.iter("field")}
@@ -213,7 +211,6 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 
 def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
-    """Yield the parameters of an apm.pdef.json."""
     for group, parameters in content.items():
         if group == "json":  # This entry is the version of the format.
             continue

@@ -35,12 +35,9 @@ _HAS_DEFAULT = 0x10
 _MAX_SIZE = 0xFFFF
 
 # The type codes in the file are those of ArduPilot's AP_Param, not MAV_PARAM_TYPE.
-_CODES = {
-    1: (ParameterType.INT8, Struct("<b")),
-    2: (ParameterType.INT16, Struct("<h")),
-    3: (ParameterType.INT32, Struct("<i")),
-    4: (ParameterType.REAL32, Struct("<f")),
-}
+_STORED_TYPES = {1: ParameterType.INT8, 2: ParameterType.INT16, 3: ParameterType.INT32, 4: ParameterType.REAL32}
+
+_FORMATS = {1: Struct("<b"), 2: Struct("<h"), 3: Struct("<i"), 4: Struct("<f")}
 
 _CODE_BY_TYPE = {
     ParameterType.INT8: 1,
@@ -119,8 +116,7 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
     for parameter in rows:
         name = check_name(parameter.name).encode("ascii")
         code = _code_of(parameter)
-        stored_type, _ = _CODES[code]
-        body += _entry(name, previous_name, code, checked_value(parameter.name, parameter.value, stored_type))
+        body += _entry(name, previous_name, code, checked_value(parameter.name, parameter.value, _STORED_TYPES[code]))
         previous_name = name
     length = HEADER.size + len(body)
     if length > _MAX_SIZE:
@@ -158,8 +154,7 @@ def pack_for_download(
         entry = _entry(name, previous_name, code, *values)
         # The last `unsplit_size` bytes of the entry must be in one block. For PX4, these are the value and its default.
         # ArduPilot (``whole_defaults=False``) keeps only the last number whole (AP_Filesystem_Param.cpp).
-        _, value_format = _CODES[code]
-        unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
+        unsplit_size = _FORMATS[code].size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
         if 0 < size_in_next_block < unsplit_size:
             file += bytes(unsplit_size - size_in_next_block)  # These zeros move the value into the next block.
@@ -183,7 +178,7 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
     has_default = bool(flags & _HAS_DEFAULT)
-    if code not in _CODES or flags & ~_HAS_DEFAULT:
+    if code not in _FORMATS or flags & ~_HAS_DEFAULT:
         raise _damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
@@ -192,7 +187,7 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     own_length = (data[position + 1] >> 4) + 1
     if common_length > len(previous_name) or common_length + own_length > NAME_LENGTH:
         raise _damaged(position, f"invalid name length {common_length} + {own_length} after {previous_name!r}")
-    kind, format_ = _CODES[code]
+    format_ = _FORMATS[code]
     start = position + 2 + own_length
     end = start + format_.size * (2 if has_default else 1)
     if end > len(data):
@@ -202,7 +197,7 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     if has_default:
         (default,) = format_.unpack_from(data, start + format_.size)
     name = previous_name[:common_length] + data[position + 2 : start]
-    return PackEntry(name, kind, value, default, end)
+    return PackEntry(name, _STORED_TYPES[code], value, default, end)
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
@@ -250,11 +245,10 @@ def _code_of(parameter: Parameter) -> int:
 
 def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:
     common = _common_length(name, previous_name)
-    _, value_format = _CODES[code]
     type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
     # Four bits for the number of shared characters, and four for the number of own characters minus 1.
     lengths = common | (len(name) - common - 1) << 4
-    return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(value_format.pack, values))
+    return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(_FORMATS[code].pack, values))
 
 
 def _common_length(name: bytes, previous_name: bytes) -> int:

@@ -109,12 +109,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
     def in_order_of_index(self) -> ParameterTable:
         """Return a copy sorted by index. Parameters without an index come last."""
-
-        def sort_key(parameter: Parameter) -> int:
-            above_all_indices = 1 << 16  # Indices have 16 bits.
-            return above_all_indices if parameter.index is None else parameter.index
-
-        return ParameterTable(sorted(self._by_name.values(), key=sort_key))
+        return ParameterTable(sorted(self._by_name.values(), key=lambda param: (param.index is None, param.index or 0)))
 
 
 def _merged(old: Parameter | None, new: Parameter) -> Parameter:
@@ -172,7 +167,10 @@ def plain_values(values: ParameterValues) -> dict[str, int | float]:
 def _same(left: float | None, right: float | None, tolerance: float) -> bool:
     if left is None or right is None:
         return left is right
-    return same_value(left, right) or abs(left - right) <= tolerance
+    try:
+        return same_value(left, right) or abs(left - right) <= tolerance
+    except OverflowError:  # An int is too large for a float.
+        return False
 
 
 def _text(value: float | None) -> str:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from aerokit.protocols.request_window import LOSS_THRESHOLD
+
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
-
-# Answers arrive in the order of the requests. When a request is answered, all unanswered requests that were sent at
-# least this many transmissions before it count as lost.
-OVERTAKEN = 3
 
 # Number of requests that are sent at once. ArduPilot queues at most five, processes one every 2 ms, and drops the rest.
 BATCH_SIZE = 4
@@ -34,7 +32,7 @@ WIDENING, NARROWING = 0.5, 0.25
 LOSS_WEIGHT, MAX_LOSS = 1 / 16, 0.75
 
 
-class AdaptiveWindow:
+class CongestionWindow:
     """Limits the number of requests in flight to what the link carries without delaying the answers.
 
     The window grows while answers arrive as fast as the fastest answers so far. It shrinks when answers take much
@@ -95,7 +93,7 @@ class BlockRequests:
     """
 
     def __init__(self, round_trip: RoundTrip, *, batch_size: int = BATCH_SIZE, spacing_s: float = SPACING_S) -> None:
-        self.window: AdaptiveWindow = AdaptiveWindow()
+        self.window: CongestionWindow = CongestionWindow()
         self._round_trip = round_trip
         self._batch_size = batch_size
         self._spacing_s = spacing_s
@@ -154,7 +152,7 @@ class BlockRequests:
         self._round_trip.add_sample(now - sent_at)
         self.window.on_answer(now - sent_at)
         if block.attempts == 1:
-            self._requeue_overtaken(block.transmission_number)
+            self._requeue_lost(block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
         """Return when the answered transmission was sent, or None if it is unknown which one was answered."""
@@ -201,13 +199,13 @@ class BlockRequests:
         block.sent_at = now
         self._in_flight[offset] = block
 
-    def _requeue_overtaken(self, number: int) -> None:
-        overtaken = []
+    def _requeue_lost(self, number: int) -> None:
+        lost = []
         for offset, block in self._in_flight.items():
-            if block.transmission_number > number - OVERTAKEN:
+            if block.transmission_number > number - LOSS_THRESHOLD:
                 break
-            overtaken.append(offset)
-        self._requeue(overtaken)
+            lost.append(offset)
+        self._requeue(lost)
 
     def _requeue(self, offsets: list[int]) -> None:
         for offset in offsets:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
@@ -31,54 +31,56 @@ __all__ = [
 MAX_ATTEMPTS = 4
 """Maximum number of transmissions of a command that may be repeated."""
 
-# Conditions in UNREPEATABLE_COMMANDS: the index of a parameter, and the value that it must have.
-_PARAM1_IS_0, _PARAM1_IS_1, _PARAM1_IS_2, _PARAM4_IS_1 = (0, 0.0), (0, 1.0), (0, 2.0), (3, 1.0)
 
-# Commands whose repetition has a further effect. Maps MAV_CMD to (effect, condition). If the condition is None, every
-# repetition has the effect.
-UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
-    MavCmd.COMPONENT_ARM_DISARM: ("arms a vehicle that a pilot has disarmed since", _PARAM1_IS_1),
-    MavCmd.CONDITION_YAW: ("turns by the same angle again", _PARAM4_IS_1),
-    MavCmd.DO_REPEAT_RELAY: ("cycles the relay again", None),
-    MavCmd.DO_REPEAT_SERVO: ("cycles the servo again", None),
-    MavCmd.DO_DIGICAM_CONTROL: ("takes another picture, zooms another step", None),
-    MavCmd.DO_SET_CAM_TRIGG_DIST: ("may take another picture at once", None),
-    MavCmd.DO_MOTOR_TEST: ("spins the motor again", None),
-    MavCmd.ACTUATOR_TEST: ("moves the actuator again", None),
-    MavCmd.DO_AUTOTUNE_ENABLE: ("restarts tuning", None),
-    MavCmd.DO_SEND_SCRIPT_MESSAGE: ("sends the message to the script again", None),
-    MavCmd.DO_AUX_FUNCTION: ("triggers the function again", None),
-    MavCmd.PREFLIGHT_CALIBRATION: ("calibrates again", None),
-    MavCmd.PREFLIGHT_STORAGE: ("writes, reads or resets all parameters again", None),
-    MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: ("reboots again", None),
-    MavCmd.DO_FLIGHTTERMINATION: ("stops the motors of a flight that began meanwhile", None),
-    MavCmd.START_RX_PAIR: ("starts pairing again", None),
-    MavCmd.STORAGE_FORMAT: ("erases what was stored meanwhile", None),
-    MavCmd.SET_CAMERA_ZOOM: ("zooms another step", _PARAM1_IS_0),
-    MavCmd.SET_CAMERA_FOCUS: ("focuses another step", _PARAM1_IS_0),
-    MavCmd.IMAGE_START_CAPTURE: ("takes another picture, or starts another series", None),
-    MavCmd.VIDEO_START_CAPTURE: ("starts another file", None),
-    MavCmd.LOGGING_START: ("starts another log", None),
-    MavCmd.DO_START_MAG_CAL: ("calibrates again", None),
-    MavCmd.FIXED_MAG_CAL_YAW: ("calibrates again", None),
-    MavCmd.DO_GRIPPER: ("moves a gripper that another station has moved meanwhile", None),
-    MavCmd.DO_PARACHUTE: ("releases a parachute that was disabled meanwhile", _PARAM1_IS_2),
-    MavCmd.INJECT_FAILURE: ("injects a failure again that was ended meanwhile", None),
-    MavCmd.DO_WINCH: ("pays out the same length again", None),
-    MavCmd.FLASH_BOOTLOADER: ("writes the bootloader again", None),
-    MavCmd.PAYLOAD_CONTROL_DEPLOY: ("drops another payload", None),
+class Repetition(NamedTuple):
+    """Further effect of a repeated command. With ``param`` (1 to 7), only if this parameter has this value."""
+
+    effect: str
+    param: int | None = None
+    value: float = 0.0
+
+
+# Commands whose repetition has a further effect.
+UNREPEATABLE_COMMANDS: Mapping[int, Repetition] = {
+    MavCmd.COMPONENT_ARM_DISARM: Repetition("arms a vehicle that a pilot has disarmed since", param=1, value=1),
+    MavCmd.CONDITION_YAW: Repetition("turns by the same angle again", param=4, value=1),
+    MavCmd.DO_REPEAT_RELAY: Repetition("cycles the relay again"),
+    MavCmd.DO_REPEAT_SERVO: Repetition("cycles the servo again"),
+    MavCmd.DO_DIGICAM_CONTROL: Repetition("takes another picture, zooms another step"),
+    MavCmd.DO_SET_CAM_TRIGG_DIST: Repetition("may take another picture at once"),
+    MavCmd.DO_MOTOR_TEST: Repetition("spins the motor again"),
+    MavCmd.ACTUATOR_TEST: Repetition("moves the actuator again"),
+    MavCmd.DO_AUTOTUNE_ENABLE: Repetition("restarts tuning"),
+    MavCmd.DO_SEND_SCRIPT_MESSAGE: Repetition("sends the message to the script again"),
+    MavCmd.DO_AUX_FUNCTION: Repetition("triggers the function again"),
+    MavCmd.PREFLIGHT_CALIBRATION: Repetition("calibrates again"),
+    MavCmd.PREFLIGHT_STORAGE: Repetition("writes, reads or resets all parameters again"),
+    MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: Repetition("reboots again"),
+    MavCmd.DO_FLIGHTTERMINATION: Repetition("stops the motors of a flight that began meanwhile"),
+    MavCmd.START_RX_PAIR: Repetition("starts pairing again"),
+    MavCmd.STORAGE_FORMAT: Repetition("erases what was stored meanwhile"),
+    MavCmd.SET_CAMERA_ZOOM: Repetition("zooms another step", param=1, value=0),
+    MavCmd.SET_CAMERA_FOCUS: Repetition("focuses another step", param=1, value=0),
+    MavCmd.IMAGE_START_CAPTURE: Repetition("takes another picture, or starts another series"),
+    MavCmd.VIDEO_START_CAPTURE: Repetition("starts another file"),
+    MavCmd.LOGGING_START: Repetition("starts another log"),
+    MavCmd.DO_START_MAG_CAL: Repetition("calibrates again"),
+    MavCmd.FIXED_MAG_CAL_YAW: Repetition("calibrates again"),
+    MavCmd.DO_GRIPPER: Repetition("moves a gripper that another station has moved meanwhile"),
+    MavCmd.DO_PARACHUTE: Repetition("releases a parachute that was disabled meanwhile", param=1, value=2),
+    MavCmd.INJECT_FAILURE: Repetition("injects a failure again that was ended meanwhile"),
+    MavCmd.DO_WINCH: Repetition("pays out the same length again"),
+    MavCmd.FLASH_BOOTLOADER: Repetition("writes the bootloader again"),
+    MavCmd.PAYLOAD_CONTROL_DEPLOY: Repetition("drops another payload"),
 }
 
 
 def allowed_attempts(command: int, params: Sequence[float]) -> int:
     """Return the maximum number of transmissions: 1 if a repetition would have a further effect, otherwise 4."""
-    if command not in UNREPEATABLE_COMMANDS:
+    repetition = UNREPEATABLE_COMMANDS.get(command)
+    if repetition is None:
         return MAX_ATTEMPTS
-    _, condition = UNREPEATABLE_COMMANDS[command]
-    if condition is None:
-        return 1
-    index, value = condition
-    return 1 if params[index] == value else MAX_ATTEMPTS
+    return 1 if repetition.param is None or params[repetition.param - 1] == repetition.value else MAX_ATTEMPTS
 
 
 BROADCAST = 0
@@ -243,7 +245,8 @@ class CommandExchange(Exchange[CommandAck]):
         self._is_sent = is_sent
         self._sent_count = 0  # number of transmissions, including a first one by the caller
         self._dropped_count = 0  # number of these transmissions that no link accepted
-        self._answer_count = 0
+        self.answers: int = 0
+        """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
         self._in_progress = False
 
     def start(self, now: float) -> None:
@@ -259,11 +262,9 @@ class CommandExchange(Exchange[CommandAck]):
         # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
         # command is repeated. A command with a single attempt ignores none, because its own may be the only one.
         may_ignore = self._transmitted_count == 1 and self._attempts > 1
-        is_to_earlier_command = not self._transmitted_count or (
-            may_ignore and self._answer_count < self._earlier_answers
-        )
+        is_to_earlier_command = not self._transmitted_count or (may_ignore and self.answers < self._earlier_answers)
         if message.result != MavResult.IN_PROGRESS:
-            self._answer_count += 1
+            self.answers += 1
         if is_to_earlier_command:
             return
         if message.result == MavResult.IN_PROGRESS:
@@ -278,13 +279,8 @@ class CommandExchange(Exchange[CommandAck]):
         """Number of acknowledgements that may still arrive. The next command with this MAV_CMD must ignore them."""
         # Once the command was repeated, every acknowledgement counts as an answer to this command; see `receive`.
         ignored_answers = self._earlier_answers if self._transmitted_count <= 1 else 0
-        own_answers = max(0, self._answer_count - ignored_answers)
+        own_answers = max(0, self.answers - ignored_answers)
         return max(0, self._transmitted_count * self._acks_per_sending - own_answers)
-
-    @property
-    def answers(self) -> int:
-        """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
-        return self._answer_count
 
     def message_dropped(self) -> None:
         self._dropped_count += 1
@@ -322,8 +318,8 @@ class CommandExchange(Exchange[CommandAck]):
         if self._sent_count < self._attempts:
             return "; not sent again: no HEARTBEAT received since then"
         if self._attempts == 1 and allowed_attempts(self._message.command, _params_of(self._message)) == 1:
-            effect, _ = UNREPEATABLE_COMMANDS[self._message.command]
-            return f"; not sent again, because a repetition {effect}"
+            repetition = UNREPEATABLE_COMMANDS[self._message.command]
+            return f"; not sent again, because a repetition {repetition.effect}"
         return ""
 
     def _send(self, now: float) -> None:

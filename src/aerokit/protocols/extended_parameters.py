@@ -34,7 +34,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 
 UNKNOWN_INDEX = 0xFFFF
-MAX_QUIET_S = 1.1  # A list counts as ended after at most this many seconds of silence.
+MAX_STREAM_TIMEOUT_S = 1.1  # A list counts as ended after at most this many seconds of silence.
 READ_WINDOW = 10
 # Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0
@@ -69,7 +69,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
     def start(self, now: float) -> None:
         self._start_clock(now)
         self._send_list_request(now)
-        self._step(now)
+        self._proceed(now)
 
     def receive(self, message: Message, now: float) -> None:
         """Process a value. Other messages, and messages of other components, are ignored."""
@@ -80,7 +80,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
         if index < count:
             self._count = count
             self._on_value(setting_of(message), index, count, now)
-        self._step(now)
+        self._proceed(now)
 
     def _list_request(self) -> Message:
         return ParamExtRequestList(self.target_system, self.target_component)
@@ -88,7 +88,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
     def _read_request(self, index: int) -> Message:
         return ParamExtRequestRead(self.target_system, self.target_component, param_id="", param_index=index)
 
-    def _on_quiet(self, now: float) -> None:
+    def _on_stream_stopped(self, now: float) -> None:
         if self._count is None:
             self._send_list_request(now)
         else:
@@ -103,8 +103,8 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
                 self._pause_s = max(self._pause_s, now - self._last_at)
             self._next_index = index + 1
             self._last_at = now
-            quiet_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
-            self._quiet_at = now + min(quiet_s, MAX_QUIET_S)
+            timeout_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
+            self._stream_deadline = now + min(timeout_s, MAX_STREAM_TIMEOUT_S)
             self._window.discard(index)
         else:
             self._window.on_answer(index, now)
@@ -114,14 +114,14 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
 
     def _end_stream(self) -> None:
         self._is_streaming = False
-        self._quiet_at = None
+        self._stream_deadline = None
         self._request_missing()
 
     def _request_missing(self) -> None:
         for index in self._missing():
             self._window.request(index)
 
-    def _conclude(self) -> None:
+    def _finish_or_request_missing(self) -> None:
         if self._is_streaming or self._count is None:
             return
         if len(self._received) >= self._count and not self._missing():
@@ -155,7 +155,7 @@ class SettingReads(NamedReads[Setting]):
     def _read_request(self, name: str, index: int) -> Message:
         return ParamExtRequestRead(self.target_system, self.target_component, name, index)
 
-    def _before_sending(self, now: float) -> None:
+    def _check_overdue(self, now: float) -> None:
         self._is_probe_wanted = bool(self._overdue(now))
 
     def _on_message(self, message: Message, now: float) -> None:
@@ -170,7 +170,7 @@ class SettingReads(NamedReads[Setting]):
             self._reject_if_requested_often(unanswered, now)
         if name and name in self._window:
             self._window.on_answer(name, now)
-            self._settle(name, setting_of(message), now)
+            self._set_result(name, setting_of(message), now)
 
 
 class SettingWrite(Transfer[Setting]):
@@ -299,7 +299,7 @@ class SettingWrite(Transfer[Setting]):
             self.round_trip.add_sample(now - self._sent_at)
 
     def _is_stale(self, now: float) -> bool:
-        return self._stale_answers.is_stale(self._name, self._sent_at, now, attempts=self._attempts)
+        return self._stale_answers.refuses(self._name, self._sent_at, now, attempts=self._attempts)
 
 
 def _is_same(first: Setting, second: Setting) -> bool:

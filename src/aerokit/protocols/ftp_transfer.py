@@ -68,10 +68,15 @@ class _SentRequest(NamedTuple):
     at: float
 
 
-class _Burst(NamedTuple):
-    sequence: int
-    offset: int
-    sent_at: float
+class _Burst:
+    """A burst request, and the last of its blocks that was received so far."""
+
+    __slots__ = ("highest_at", "highest_block", "offset", "sent_at", "sequence")
+
+    def __init__(self, sequence: int, offset: int, sent_at: float) -> None:
+        self.sequence, self.offset, self.sent_at = sequence, offset, sent_at
+        self.highest_block = -1  # number of the block with the largest offset; -1 before the first block
+        self.highest_at = sent_at  # time at which it arrived
 
     def blocks_before(self, reply: FtpMessage) -> int:
         return (reply.sequence - self.sequence - 1) % SEQUENCE_COUNT
@@ -123,12 +128,8 @@ class FtpDownload(FtpExchange[int]):
         self._is_bursting = False
         self._failed_bursts = 0
         self._bursts_without_new_block = 0  # number of bursts requested since a missing block was received
-        self._highest_blocks: dict[int, int] = {}  # highest received block number, by the burst's sequence number
         self._supports_bursts = True
         self._burst_active_at = 0.0  # time of the latest burst request or block of a burst
-        self._last_burst: _Burst | None = None  # burst of the latest block
-        self._highest_number = -1  # highest block number received of this burst
-        self._highest_at = 0.0  # time at which the block with this number arrived
         self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
 
     def start(self, now: float) -> None:
@@ -183,21 +184,19 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _record_block(self, burst: _Burst, number: int, now: float) -> None:
+        if number <= burst.highest_block:  # The block is late or repeated.
+            return
         # Blocks that a repeated burst sends again also count as progress, because they show that the server works. The
         # number of such bursts is limited, so that the download cannot go on forever.
-        is_further = number > self._highest_blocks.get(burst.sequence, -1)
-        if is_further and self._bursts_without_new_block <= MAX_REPEATED_BURSTS:
-            self._highest_blocks[burst.sequence] = number
+        if self._bursts_without_new_block <= MAX_REPEATED_BURSTS:
             self._progress_at = now
+        if burst.highest_block >= 0:
+            self._interval.add_sample((now - burst.highest_at) / (number - burst.highest_block))
         # Only the first burst measures the round trip, because a later burst may have to wait for the end of an earlier
         # one.
-        if self._last_burst is None and number == 0 and len(self._bursts) == 1:
+        elif number == 0 and len(self._bursts) == 1:
             self.round_trip.add_sample(now - burst.sent_at)
-        elif self._last_burst is burst and number > self._highest_number:
-            self._interval.add_sample((now - self._highest_at) / (number - self._highest_number))
-        is_late = self._last_burst is burst and number <= self._highest_number
-        if not is_late:
-            self._last_burst, self._highest_number, self._highest_at = burst, number, now
+        burst.highest_block, burst.highest_at = number, now
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
@@ -327,7 +326,7 @@ class FtpDownload(FtpExchange[int]):
             if self._size is not None and self._size > SHORT_FILE:
                 silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
         else:
-            has_started = self._last_burst is self._bursts[-1]
+            has_started = self._bursts[-1].highest_block >= 0
             max_lost = MAX_LOST_BLOCKS if has_started else MAX_LOST_FIRST_BLOCKS
             silence_s += max(max_lost * self._interval.smoothed_s, self._interval.timeout_s())
         return self._burst_active_at + silence_s

@@ -35,9 +35,9 @@ BY_NAME = -1
 PROBE, PROBE_INDEX = "", 0
 # A name without an answer counts as unknown once the probability that all its answers were lost is below this value.
 MAX_LOSS_PROBABILITY = 1e-4
-# An unexpected value is the result of a write after this many equal answers. The value from before the write needs more
-# answers, because the vehicle may have sent some of them before the write arrived.
-ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
+# An unexpected value is the result of a write after MIN_EQUAL_ANSWERS. The value from before the write needs more,
+# because the vehicle may have sent some of them before the write arrived.
+MIN_EQUAL_ANSWERS, MIN_UNCHANGED_ANSWERS = 2, 8
 
 
 class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
@@ -55,7 +55,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self._count: int | None = None
         self._next_index = 0  # next index that is expected in the stream
         self._is_streaming = False
-        self._quiet_at: float | None = None  # The stream has stopped if no message of it arrives before this time.
+        self._stream_deadline: float | None = None  # when the stream counts as stopped if no message arrives
         self._last_at = 0.0  # time of the stream's last message
         self._pause_s = 0.0  # longest pause of the stream; ParameterList lets it decay
         self._attempts = 0  # number of requests for the list
@@ -67,9 +67,9 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         if self._is_idle(now):
             self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))
             return
-        if self._quiet_at is not None and now >= self._quiet_at:  # The stream has stopped.
-            self._on_quiet(now)
-        self._step(now)
+        if self._stream_deadline is not None and now >= self._stream_deadline:  # The stream has stopped.
+            self._on_stream_stopped(now)
+        self._proceed(now)
 
     @abstractmethod
     def _list_request(self) -> Message: ...
@@ -78,18 +78,17 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
     def _read_request(self, index: int) -> Message: ...
 
     @abstractmethod
-    def _on_quiet(self, now: float) -> None:
+    def _on_stream_stopped(self, now: float) -> None:
         """Called when the stream has not started, or has stopped before its end."""
 
     @abstractmethod
-    def _conclude(self) -> None:
-        """Finish if the list is complete. Otherwise queue requests for the missing indices."""
+    def _finish_or_request_missing(self) -> None: ...
 
     def _send_list_request(self, now: float) -> None:
         self._attempts += 1
         self._is_streaming = True
         self._outbox.append(self._list_request())
-        self._quiet_at = now + max(self.round_trip.timeout_s(self._attempts), MIN_START_TIMEOUT_S)
+        self._stream_deadline = now + max(self.round_trip.timeout_s(self._attempts), MIN_START_TIMEOUT_S)
 
     def _store(self, index: int, value: ValueT, reported_count: int, now: float) -> None:
         is_new = index not in self._received
@@ -99,13 +98,13 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             count = self._count or 0
             self._report_progress(now, min(len(self._received), count), count)
 
-    def _step(self, now: float) -> None:
-        self._conclude()
+    def _proceed(self, now: float) -> None:
+        self._finish_or_request_missing()
         if self.done:
             return
         for index in self._window.take_due(now):
             self._outbox.append(self._read_request(index))
-        times = (self._window.deadline, self._quiet_at, self._idle_deadline)
+        times = (self._window.deadline, self._stream_deadline, self._idle_deadline)
         self.deadline: float | None = min(at for at in times if at is not None)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
@@ -157,13 +156,13 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._start_clock(now)
         for name in self._names:
             self._window.request(name)
-        self._step(now)
+        self._proceed(now)
 
     def receive(self, message: Message, now: float) -> None:
         """Process an answer. Other messages, and messages of other components, are ignored."""
         if not self.done and self._is_from_target(message):
             self._on_message(message, now)
-            self._step(now)
+            self._proceed(now)
 
     def expire(self, now: float) -> None:
         if self.deadline is None or now < self.deadline:
@@ -172,7 +171,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
             for name in self._names:
                 if name not in self._results:
                     self._results[name] = ParameterTimeout(self._timeout_text(name), missing=(name,))
-        self._step(now)
+        self._proceed(now)
 
     @abstractmethod
     def _request(self, name: str) -> list[Message]: ...
@@ -183,25 +182,25 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _timeout_text(self, name: str) -> str:
         return f"{name} was not answered, requested {self._window.attempts(name)} times"
 
-    def _before_sending(self, now: float) -> None: ...
+    def _check_overdue(self, now: float) -> None: ...
 
-    def _after_sending(self, now: float) -> None: ...
+    def _send_probe_if_wanted(self, now: float) -> None: ...
 
-    def _settle(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
+    def _set_result(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
         self._window.discard(name)
         self._results[name] = answer
         self._report_progress(now, len(self._results), len(self._names))
 
-    def _step(self, now: float) -> None:
+    def _proceed(self, now: float) -> None:
         if len(self._results) < len(self._names):
-            self._before_sending(now)  # This call may settle the last names.
+            self._check_overdue(now)  # This call may set the last results.
         if len(self._results) == len(self._names):
             self._finish({name: self._results[name] for name in self._names})
             return
         for name in self._window.take_due(now):
             self._outbox += self._request(name)
             self._sent_at[name] = now
-        self._after_sending(now)
+        self._send_probe_if_wanted(now)
         times = (self._window.deadline, self._idle_deadline)
         self.deadline: float | None = min(at for at in times if at is not None)
 
@@ -229,7 +228,7 @@ class NamedReads(NamedRequests[ValueT]):
     def _overdue(self, now: float) -> list[str]:
         return [name for name in self._window.overdue(now) if name != PROBE]
 
-    def _after_sending(self, now: float) -> None:
+    def _send_probe_if_wanted(self, now: float) -> None:
         if self._is_probe_wanted and PROBE not in self._window:
             self._window.record_sent(PROBE, now)
             self._outbox += self._request(PROBE)
@@ -244,7 +243,7 @@ class NamedReads(NamedRequests[ValueT]):
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
                 text = f"{self.unknown_text} {name}: it answers requests for other names, but not for this one"
-                self._settle(name, ParameterRejected(text, name=name), now)
+                self._set_result(name, ParameterRejected(text, name=name), now)
 
     def _loss_probability(self, attempts: int) -> float:
         if not self._probes_answered:
@@ -278,5 +277,5 @@ class RepeatedAnswers(Generic[ValueT]):
 
         ``is_unchanged`` is True if they have the value from before the write.
         """
-        needed = ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE
+        needed = MIN_UNCHANGED_ANSWERS if is_unchanged else MIN_EQUAL_ANSWERS
         return len(self._answers) >= needed

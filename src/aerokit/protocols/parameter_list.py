@@ -87,7 +87,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._send_list_request(now)
         if self.round_trip.smoothed_s is None:
             self._window.request(0)
-        self._step(now)
+        self._proceed(now)
 
     def receive(self, message: Message, now: float) -> None:
         """Process a value or an error. Other messages, and messages of other components, are ignored."""
@@ -99,7 +99,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._on_refusal(message)
         else:
             return
-        self._step(now)
+        self._proceed(now)
 
     # ------------------------------------------------------------------------------------ answers
 
@@ -118,7 +118,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         # A value that we have requested delays the stream, so it also restarts the stream's time-out. Near the end of
         # the list, only streamed values do, so that the last missing values are requested early.
         if self._is_streaming and (is_streamed or (is_requested and not self._is_near_end)):
-            self._quiet_at = now + self._quiet_s()
+            self._stream_deadline = now + self._stream_timeout_s()
         parameter = parameter_of(message, self._bytewise)
         if parameter.name not in self._parameters and len(self._parameters) >= MAX_PARAMETERS:
             return  # A faulty vehicle must not fill the memory.
@@ -131,7 +131,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._record_count(message.param_count, is_streamed=False)
         if message.param_id == HASH_NAME:
             self._last_at = now
-            self._quiet_at = (now + self._quiet_s()) if self._is_streaming else None
+            self._stream_deadline = (now + self._stream_timeout_s()) if self._is_streaming else None
         elif message.param_id in self._parameters:
             reported = parameter_of(message, self._bytewise)
             self._parameters[reported.name] = merge_update(self._parameters[reported.name], reported, self._bytewise)
@@ -185,7 +185,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _read_request(self, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, param_id="", param_index=index)
 
-    def _on_quiet(self, now: float) -> None:
+    def _on_stream_stopped(self, now: float) -> None:
         is_short_list = self._count is not None and self._count <= MIN_STREAMED
         has_started = self._streamed_count >= MIN_STREAMED or is_short_list
         if has_started:
@@ -195,10 +195,10 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
 
     def _end_stream(self) -> None:
         self._is_streaming = False
-        self._quiet_at = None
+        self._stream_deadline = None
         self._must_request_missing = True
 
-    def _quiet_s(self) -> float:
+    def _stream_timeout_s(self) -> float:
         """Return after how many seconds without a value the stream counts as stopped."""
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed_count < MIN_STREAMED:  # A single value may be the answer to our request by index.
@@ -210,7 +210,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _is_near_end(self) -> bool:
         return self._count is not None and self._count - self._next_index <= NEAR_END
 
-    def _conclude(self) -> None:
+    def _finish_or_request_missing(self) -> None:
         if self._is_streaming:
             return
         self._finish_when_complete()

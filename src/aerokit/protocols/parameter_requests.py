@@ -77,7 +77,7 @@ class ParameterRequests(NamedRequests[Parameter]):
         name = message.param_id  # The index and the target ids are not used, because PX4 does not initialise them.
         if name in self._names and name in self._window:
             self._window.on_answer(name, now)
-            self._settle(name, rejection(name, message.error), now)
+            self._set_result(name, rejection(name, message.error), now)
 
 
 def rejection(name: str, code: int) -> ParameterRejected:
@@ -136,7 +136,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
 
-    def _before_sending(self, now: float) -> None:
+    def _check_overdue(self, now: float) -> None:
         if self._may_probe and (overdue := self._overdue(now)):
             self._reject_if_requested_often(overdue, now)
             self._is_probe_wanted = True
@@ -147,9 +147,9 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
         if is_probe_answer:
             self._count_probe()
-            overtaken = self._window.on_answer(PROBE, now, overtaken=1)
-            if overtaken:
-                self._reject_if_requested_often(overtaken, now)
+            lost = self._window.on_answer(PROBE, now, loss_threshold=1)
+            if lost:
+                self._reject_if_requested_often(lost, now)
                 self._is_probe_wanted = True
         name = message.param_id
         if name and name in self._window:
@@ -159,14 +159,14 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             if old_value is not None and same_value(old_value, reported.value):
                 self._window.request(name)  # Read it once more, because a delayed message may have had the old value.
             else:
-                self._settle(name, reported, now)
+                self._set_result(name, reported, now)
                 self._reject_alternatives(name, now)
 
     def _reject_alternatives(self, name: str, now: float) -> None:
         for alternative in self._alternatives.get(name, ()):
             if alternative in self._names and alternative not in self._results:
                 text = f"the vehicle has no parameter {alternative}; its name on this vehicle is {name}"
-                self._settle(alternative, ParameterRejected(text, name=alternative), now)
+                self._set_result(alternative, ParameterRejected(text, name=alternative), now)
 
     def _on_error(self, message: ParamError, now: float) -> None:
         # PX4 also answers DOES_NOT_EXIST if it has no room to send the value. The request is therefore repeated once.
@@ -269,10 +269,18 @@ class ParameterWrites(ParameterRequests):
         # The requested value with another type must be reported twice.
         if is_as_requested and (reported.type == requested.type or answers.ends_with(reported)):
             self._window.on_answer(name, now)
-            self._settle(name, reported, now)
+            self._set_result(name, reported, now)
             return
+        self._on_unexpected_value(name, reported, now, is_as_requested=is_as_requested)
+
+    def _on_unexpected_value(self, name: str, reported: Parameter, now: float, *, is_as_requested: bool) -> None:
+        """Write or read again, unless enough equal answers have arrived.
+
+        With ``is_as_requested``, only the type of the value is unexpected.
+        """
+        answers = self._repeated_answers[name]
         sent_at = self._sent_at.get(name, now)
-        if self._stale_answers.is_stale(name, sent_at, now, attempts=self._window.attempts(name)):
+        if self._stale_answers.refuses(name, sent_at, now, attempts=self._window.attempts(name)):
             return
         answers.add(reported)
         before = self._before.get(name)  # None if unknown
@@ -285,7 +293,7 @@ class ParameterWrites(ParameterRequests):
             return  # The request is repeated when it is overdue.
         self._window.on_answer(name, now)
         if is_conclusive:
-            self._settle(name, reported, now)
+            self._set_result(name, reported, now)
         else:
             self._window.request(name)
 

@@ -25,8 +25,8 @@ FEW_LEFT_TIMEOUT_S = 0.5
 # Maximum time-out, even if answers have taken longer so far: the queue that delayed them may be empty by then.
 MAX_TIMEOUT_S = 2.0
 # Answers arrive in the order of the requests. When a request is answered, all unanswered requests that were sent at
-# least this many transmissions before it count as lost.
-OVERTAKEN = 3
+# least this many transmissions before it count as lost (like the packet threshold of QUIC, RFC 9002).
+LOSS_THRESHOLD = 3
 
 
 class _Request:
@@ -59,12 +59,12 @@ class RequestWindow(Generic[KeyT]):
         self._fastest_s = math.inf
         self._duplicate_last = duplicate_last
         self._answered_at = -math.inf
-        self._silences = 0  # number of consecutive time-outs without any answer
-        self._next_silence_at = -math.inf  # earliest time to increase `_silences`
+        self._timeouts = 0  # number of consecutive time-outs without any answer
+        self._next_timeout_at = -math.inf  # earliest time to increase `_timeouts`
         self._waiting: dict[KeyT, None] = {}  # requests to send, in order
         self._in_flight: dict[KeyT, _Request] = {}  # in the order in which they were sent
         self._requests: dict[KeyT, _Request] = {}  # requests in flight, or waiting to be sent again
-        # By key of a repeated request: seconds from its first transmission to its answer. See `_on_second_answer`.
+        # By key of a repeated request: seconds from its first transmission to its answer. See `_on_duplicate_answer`.
         self._ambiguous: dict[KeyT, float] = {}
         self._sent_count = 0
 
@@ -101,18 +101,18 @@ class RequestWindow(Generic[KeyT]):
         self._in_flight.pop(key, None)
         self._requests.pop(key, None)
 
-    def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
+    def on_answer(self, key: KeyT, now: float, *, loss_threshold: int = LOSS_THRESHOLD) -> list[KeyT]:
         """Record an answer. Requeue the requests that are presumed lost, and return them.
 
-        A request is presumed lost if it was last sent at least ``overtaken`` transmissions before the answered one.
+        Lost are requests that were last sent at least ``loss_threshold`` transmissions before the answered one.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
         self._in_flight.pop(key, None)
         self._answered_at = now
-        self._silences = 0
+        self._timeouts = 0
         if request is None:
-            self._on_second_answer(key)
+            self._on_duplicate_answer(key)
             return []
         if request.attempts == 1:
             self._measure(now - request.first_at)
@@ -121,7 +121,7 @@ class RequestWindow(Generic[KeyT]):
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
             # The answer may belong to the first transmission, so only requests sent before that one count as lost.
-            if request_in_flight.last_number > request.first_number - overtaken:
+            if request_in_flight.last_number > request.first_number - loss_threshold:
                 break  # All further requests were sent later.
             lost.append(key_in_flight)
         self._requeue(lost)
@@ -136,7 +136,7 @@ class RequestWindow(Generic[KeyT]):
         # If nothing was answered since an overdue request was sent, the whole link is silent.
         is_silent = any(self._in_flight[key].sent_at >= self._answered_at for key in overdue)
         if is_silent:
-            self._on_silence(now)
+            self._on_timeout(now)
         self._requeue(overdue)
         due: list[KeyT] = []
         while self._waiting and len(self._in_flight) < self._max_in_flight:
@@ -151,17 +151,17 @@ class RequestWindow(Generic[KeyT]):
             due += duplicates
         return due
 
-    def _on_silence(self, now: float) -> None:
+    def _on_timeout(self, now: float) -> None:
         # The link may be down, so fewer requests are sent at a time, and less often.
         self._max_in_flight = self._initial_size
-        if now >= self._next_silence_at:
-            self._silences += 1
-            self._next_silence_at = now + self._timeout_s(1)
+        if now >= self._next_timeout_at:
+            self._timeouts += 1
+            self._next_timeout_at = now + self._timeout_s(1)
 
     def _timeout_s(self, attempts: int) -> float:
         round_trip = self._round_trip
         # Each silence of the whole link lengthens the wait. The loss of single frames does not.
-        seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
+        seconds = round_trip.timeout_s(min(attempts, 2) + self._timeouts)
         if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:
             seconds = min(seconds, max(FEW_LEFT_TIMEOUT_S, 2 * round_trip.smoothed_s))
         return min(seconds, MAX_TIMEOUT_S)
@@ -193,9 +193,9 @@ class RequestWindow(Generic[KeyT]):
                 del self._in_flight[key]
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
-    def _on_second_answer(self, key: KeyT) -> None:
-        # Two answers mean that nothing was lost, and the request was repeated too early. The first answer therefore
-        # belongs to the first transmission. Its round trip makes the time-out longer.
+    def _on_duplicate_answer(self, key: KeyT) -> None:
+        # Two answers mean a spurious retransmission: nothing was lost. The first answer therefore belongs to the first
+        # transmission. Its round trip makes the time-out longer.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

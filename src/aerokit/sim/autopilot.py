@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from itertools import pairwise
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
@@ -241,10 +241,20 @@ class SimulatedAutopilot(SimulatedVehicle):
 
 
 _DISCHARGE_CURVE = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
-# The lines between neighbouring points, from full to empty. Each tuple has the percent and the volts at the lower end,
-# and the slope in volts per percent.
+
+
+class _DischargeSegment(NamedTuple):
+    """Straight line between two neighbouring points of the discharge curve."""
+
+    low_percent: float
+    low_volts: float
+    volts_per_percent: float
+
+
+# The segments from full to empty.
 _DISCHARGE_SEGMENTS = tuple(
-    (low, volts, (high_volts - volts) / (high - low)) for (low, volts), (high, high_volts) in pairwise(_DISCHARGE_CURVE)
+    _DischargeSegment(low, volts, (high_volts - volts) / (high - low))
+    for (low, volts), (high, high_volts) in pairwise(_DISCHARGE_CURVE)
 )[::-1]
 
 

@@ -13,7 +13,7 @@ from aerokit.mavlink.messages import Heartbeat
 
 @dataclass
 class CommandFault:
-    """Fault of one command, which applies ``times`` times. None means that the fault applies every time."""
+    """Fault that applies to the next ``times`` commands with the same MAV_CMD, or to all if ``times`` is None."""
 
     times: int | None = None
     refuse_with: int | None = None
@@ -42,10 +42,10 @@ class Faults:
     - ``heartbeats_stopped``: HEARTBEAT stops, all other streams continue
     - ``frozen``: the autopilot hangs; it does not receive, move or send until the fault is False again
     - ``silent``: the radio fails in both directions; the vehicle continues to fly
-    - ``prearm_failures``: additional reasons of the arming checks, such as "Compass not healthy"
+    - ``prearm_failures``: additional failures of the arming checks, such as "Compass not healthy"
     - ``drop_outgoing``, ``drop_incoming``: how many of the next frames to lose; each lost frame decrements the number
-    - ``loss``, ``loss_incoming``: share of outgoing and incoming frames to lose, 0 to 1; chosen at random from the
-      vehicle's seed
+    - ``loss``, ``loss_incoming``: share of the outgoing and the incoming frames to lose, 0 to 1; the vehicle's seed
+      determines which frames
     - ``lost_messages``: how many of the next outgoing messages to lose, by message id; see ``lose``
     - ``motor_failed``: one motor stops; the vehicle cannot hold its altitude and descends
     - ``no_ftp``: FILE_TRANSFER_PROTOCOL is not answered and not in the capabilities
@@ -132,7 +132,7 @@ class Faults:
     def report_progress(
         self, command: int, percents: tuple[int, ...] = (10, 50, 90), *, interval_s: float = 0.5
     ) -> None:
-        """Answer IN_PROGRESS with these percentages before the result, one every ``interval_s`` seconds."""
+        """Answer this MAV_CMD with IN_PROGRESS, a percentage every ``interval_s`` seconds, and then with the result."""
         self.commands[command] = CommandFault(progress=percents, progress_interval_s=interval_s)
 
     def clear(self, command: int | None = None) -> None:

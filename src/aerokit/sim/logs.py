@@ -202,8 +202,8 @@ class ArduPilotLogServer(LogServer):
 class Px4LogServer(LogServer):
     """PX4's log server. Log numbers start at 0, and data is sent only after a list request.
 
-    The ``end`` of a list request is ignored. A new request replaces the transfer. The last block is not cut to the
-    requested size. Without logs, a list request is not answered.
+    All logs from ``start`` are listed, and ``end`` is only copied to ``last_log_num``. A new request replaces the
+    transfer. The last block is not cut to the requested size. Without logs, a list request is not answered.
     """
 
     _was_listed = False

@@ -62,7 +62,7 @@ _PLACEHOLDER_SIZE = 1 << 20
 
 
 class MissionMount(Mount):
-    """The virtual files of ``@MISSION``. One upload at a time is accepted. Opening a file reports 1 MiB as its size."""
+    """The virtual files of ``@MISSION``. They accept one upload at a time. Opening always reports a size of 1 MiB."""
 
     def __init__(self, store: MissionStore) -> None:
         self._store = store

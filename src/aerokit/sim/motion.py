@@ -80,7 +80,7 @@ GRAVITY_M_S2 = 9.80665
 # quadrotor of 450 mm does.
 _DRAG_PER_S = 0.33
 _VELOCITY_TIME_CONSTANT_S = 0.3
-# Share of a lean error that remains after a second. The lean has a time constant of 0.15 s, and steps of 0.02 s.
+# Share of a lean error that remains after a second, which has 50 steps of 0.02 s. The time constant is 0.15 s.
 _LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
@@ -115,8 +115,11 @@ def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the speed at which a vehicle approaches a point ``distance`` metres away, to stop there."""
-    # Near the point, the speed is `gain` times the distance. Farther away, it allows a constant deceleration.
+    """Return the speed in m/s that lets a vehicle stop at a point ``distance`` metres away.
+
+    Near the point, the speed is ``gain`` (per second) times the distance. Farther away, the speed is that of a constant
+    ``deceleration``.
+    """
     linear_distance = deceleration / (gain * gain)
     if distance <= linear_distance:
         return distance * gain
@@ -177,13 +180,15 @@ class Motion:
         self.yaw_rate: float = 0.0
         self.impact_speed_m_s: float = 0.0
         """Vertical speed at the last touchdown."""
-        # Present wind in addition to the mean wind, in m/s.
+        # Present gust in m/s, which is added to the mean wind.
         self._gust_north = 0.0
         self._gust_east = 0.0
         self._jerk_m_s3 = math.inf  # present change of the acceleration; infinite before the first step
         # The target velocity (north, east, down), or the target acceleration if `_target_is_acceleration` is True.
         self._target = (0.0, 0.0, 0.0)
         self._target_is_acceleration = False
+        # Acceleration (north, east, down) that is added to the one towards the target velocity.
+        self._feed_forward = (0.0, 0.0, 0.0)
         # The target roll and pitch, which replace the horizontal components of `_target`; None without such a target.
         self._target_lean: tuple[float, float] | None = None
         self._wanted_yaw: float | None = None  # None while the vehicle turns with `_wanted_yaw_rate`
@@ -205,6 +210,11 @@ class Motion:
     def seek_velocity(self, north: float, east: float, down: float) -> None:
         self._set_target((north, east, down))
 
+    def follow_trajectory(self, velocity: Ned, acceleration: Ned) -> None:
+        """Seek a velocity with a feed-forward acceleration; only the lean limits the horizontal acceleration."""
+        self._set_target(velocity)
+        self._feed_forward = acceleration
+
     def seek_acceleration(self, north: float, east: float, down: float) -> None:
         self._set_target((north, east, down), is_acceleration=True)
 
@@ -216,6 +226,7 @@ class Motion:
         self, target: Ned, *, is_acceleration: bool = False, lean: tuple[float, float] | None = None
     ) -> None:
         self._target = target
+        self._feed_forward = (0.0, 0.0, 0.0)
         self._target_is_acceleration = is_acceleration
         self._target_lean = lean
 
@@ -307,18 +318,21 @@ class Motion:
     def _commanded_acceleration(self) -> tuple[float, float, float]:
         limits = self.limits
         north, east, down = self._target
+        forward_north, forward_east, forward_down = self._feed_forward
         if not self._target_is_acceleration:
-            north = (north - self.velocity_north) / _VELOCITY_TIME_CONSTANT_S
-            east = (east - self.velocity_east) / _VELOCITY_TIME_CONSTANT_S
-            down = (down - self.velocity_down) / _VELOCITY_TIME_CONSTANT_S
+            north = (north - self.velocity_north) / _VELOCITY_TIME_CONSTANT_S + forward_north
+            east = (east - self.velocity_east) / _VELOCITY_TIME_CONSTANT_S + forward_east
+            down = (down - self.velocity_down) / _VELOCITY_TIME_CONSTANT_S + forward_down
         down = _clamp(down, limits.vertical_acceleration_m_s2)
         if self._target_lean is not None:
             roll, pitch = self._target_lean
             return (*self._acceleration_from_lean(roll, pitch), down)
         horizontal = math.hypot(north, east)
-        if horizontal > limits.acceleration_m_s2:
-            north = north * limits.acceleration_m_s2 / horizontal
-            east = east * limits.acceleration_m_s2 / horizontal
+        max_m_s2 = limits.acceleration_m_s2
+        if any(self._feed_forward):
+            max_m_s2 = max(max_m_s2, GRAVITY_M_S2 * math.tan(limits.lean_rad))
+        if horizontal > max_m_s2:
+            north, east = north * max_m_s2 / horizontal, east * max_m_s2 / horizontal
         return north, east, down
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.pack import HASH_NAME, px4_hash
 from aerokit.protocols.servers import parameters as servers
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.sim.channel import Channel
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import SimulatedVehicle, sender_of
@@ -150,7 +151,8 @@ class Px4ParameterServer(ParameterServer):
     """Parameter protocol of PX4. With ``sends_errors``, it sends PARAM_ERROR, as PX4 does after version 1.16.
 
     Values are stored without a check. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly
-    after. Setting _HASH_CHECK stops a running list. A second list request restarts the list, without the hash.
+    after. A list begins with _HASH_CHECK. A request during a list restarts the list without _HASH_CHECK. A PARAM_SET
+    of _HASH_CHECK stops the list.
     """
 
     burst = 10
@@ -215,6 +217,6 @@ class Px4ParameterServer(ParameterServer):
             return MavParamError.TYPE_UNSUPPORTED
         return None if type_ == self._parameters.type(name) else MavParamError.TYPE_MISMATCH
 
-    def _refuse(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
+    def _refuse(self, to: ComponentIds, name: str, index: int, code: int, channel: Channel) -> None:
         if self.sends_errors:
             self.send_error(to, name, index, code, channel)

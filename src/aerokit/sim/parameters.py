@@ -56,7 +56,8 @@ class SimParameter:
 class SimParameters:
     """Parameters by name, in the vehicle's order. They survive a reboot.
 
-    A value is stored in the type of the parameter: as a 32-bit float, or truncated to an integer within the range.
+    A value is stored in the type of the parameter: as a 32-bit float, or as an integer, which is truncated and limited
+    to the range of the type.
     """
 
     def __init__(self, rows: Iterable[SimParameter]) -> None:
@@ -204,9 +205,9 @@ _GUESSED_ROW_SIZE = 12
 class ParameterPackMount(Mount):
     """Files mounted as ``@PARAM``.
 
-    ``apply(name, value)`` is called for each uploaded parameter. No value extends over the end of a block. PX4 has the
-    fixed block size ``block``, and reports the exact size of a file when the file is opened. With ArduPilot, ``block``
-    is None and the first read of the client sets the block size.
+    ``apply(name, value)`` is called for each uploaded parameter. A download is padded, so that no value extends over
+    the end of a block. ``block`` is the fixed block size of PX4, which reports the exact size of a file when the file
+    is opened. For ArduPilot, ``block`` is None, and the first read of the client sets the block size.
     """
 
     def __init__(
@@ -230,7 +231,7 @@ class ParameterPackMount(Mount):
 
 
 class _Reader(FileHandle):
-    """Download of parameters. All reads must have the same size, so that no value extends over two blocks."""
+    """Download of parameters. All reads must have the same size, which is the block size of the padding."""
 
     def __init__(self, parameters: SimParameters, path: str, block: int | None) -> None:
         query = _query(path)
@@ -240,8 +241,8 @@ class _Reader(FileHandle):
         if self._with_defaults > 1 or max(self._start, self._count) >= 0xFFFF:
             raise FileFault(EINVAL)
         self._block = block or 0  # The block size; 0 means that the first read determines the size.
-        # PX4 keeps a value and its default in the same block. Only PX4 passes `block`.
-        self._whole_defaults = block is not None
+        is_px4 = block is not None
+        self._whole_defaults = is_px4  # PX4 keeps a value and its default in the same block.
         self._content: bytes | None = None  # the whole file; None before the first read
 
     @property

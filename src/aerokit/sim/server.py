@@ -17,13 +17,13 @@ from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-# Minimum delay of a timer in loop time with many vehicles, or if the simulation is faster than real time. One callback
-# then runs several ticks.
+# With a speedup, or with more than `_BATCH_THRESHOLD` vehicles, a timer waits at least this many seconds of loop time.
+# One callback then runs several ticks.
 _MIN_BATCH_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
 # With more than `_BATCH_THRESHOLD` vehicles, the output of `_BATCH_INTERVAL_S` simulated seconds is sent together.
 _BATCH_INTERVAL_S = TICK_S
-# Maximum simulated seconds to make up for after the event loop was blocked. In real time, there is no maximum.
+# With a speedup, at most this many simulated seconds are made up for after the event loop was blocked.
 _MAX_CATCH_UP_S = 0.5
 
 
@@ -33,8 +33,9 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. After the loop was blocked, the server simulates the missed time. With a ``speedup`` other than 1, it
-    simulates at most half a second of it, because missing heartbeats would look like a link loss.
+    second. After the loop was blocked, the server simulates the missed time. With a ``speedup`` other than 1, the
+    server simulates at most half a second and skips the rest. Otherwise, missing heartbeats would look like a link
+    loss.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
@@ -122,7 +123,7 @@ class SimulatorServer:
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
-        connected: set[int] = set()  # ids of vehicles whose first channel is in use; filled by `_channels`
+        connected: set[int] = set()  # `id` of each vehicle whose first channel is in use; filled by `_channels`
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
             opening.push_async_callback(port.close)
@@ -180,8 +181,9 @@ class SimulatorServer:
         for link in self._links:
             link.close()
         owner = self._owner
-        # asyncio only logs the exception of a callback, so the owner is cancelled. In a fixture, it may be done.
-        if owner is not None and not owner.done() and owner is not asyncio.current_task():
+        if owner is None or owner.done():  # The task of a pytest fixture may end before the block ends.
+            return
+        if owner is not asyncio.current_task():  # In a callback, asyncio would only log the exception.
             self._cancels_owner = owner.cancel()
 
     def _stop(self) -> None:
@@ -216,7 +218,7 @@ class SimulatorServer:
                 is_from_vehicle = False
                 self.on_datagram(now, data, is_from_vehicle)
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # The vehicle's time is later than `now` if a timer fired early or another vehicle advanced it.
+                # `vehicle.now` is later than `now` if a timer fired early or another vehicle has advanced this one.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()  # All vehicles have used the decoded messages.
@@ -260,7 +262,8 @@ class SimulatorServer:
         if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at
-        skipped_s = self._loop.time() - due_at - _MAX_CATCH_UP_S / self._speedup
+        late_s, max_late_s = self._loop.time() - due_at, _MAX_CATCH_UP_S / self._speedup
+        skipped_s = late_s - max_late_s
         if skipped_s > 0:  # `now` counts from `_started_at`, so a later start skips time.
             self._started_at += skipped_s
             self._timer_at += skipped_s

@@ -290,8 +290,12 @@ class SimulatedVehicle:
         is_ticking = self._first_tick_at != math.inf
         if ticking == is_ticking:
             return
-        # Ticks are multiples of TICK_S since the boot, so that ticks, timers and streams are due at the same instants.
-        self._first_tick_at = self.booted_at + _whole_ticks(self.uptime) * TICK_S if ticking else math.inf
+        if ticking:
+            # Ticks are multiples of TICK_S since the boot, so that ticks, timers and streams are due at the same
+            # instants.
+            self._first_tick_at = self.booted_at + _whole_ticks(self.uptime) * TICK_S
+        else:
+            self._first_tick_at = math.inf
         self._ticks_done = 0
         self._schedule_tick(1)
 
@@ -350,7 +354,8 @@ class SimulatedVehicle:
 
     def send(self, message: Message, channel: Channel | None = None, sender: tuple[int, int] | None = None) -> None:
         """Send a message on one channel, or on all if None. A frame lost by `Faults` leaves a sequence gap."""
-        for port in self.channels if channel is None else (channel,):
+        ports = self.channels if channel is None else (channel,)
+        for port in ports:
             data = port.encode(message, sender)
             if not self.faults.drops_outgoing(message, self.rng):
                 port.write(data)

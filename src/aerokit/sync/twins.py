@@ -1152,6 +1152,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
+            OperationRejected: another order was given before the answer.
         """
         self._loop.run(self.aio.stop_looking)
 
@@ -1985,6 +1986,7 @@ class Winch(TwinOf["AsyncWinch"]):
             NotSupported: the autopilot has no such order. Nothing was sent.
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: your program gave a newer order for this winch before the acknowledgement.
         """
         self._loop.run(self.aio.relax)
 
@@ -1992,7 +1994,8 @@ class Winch(TwinOf["AsyncWinch"]):
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
         Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a second
-        one would pay out more line.
+        one would pay out more line. If the winch is turning already, it adds the length to that at which the command
+        arrives, and the call returns when the winch has stopped there.
 
         Args:
             length_m: metres, −1000 to 1000; negative values wind the line up.
@@ -2647,6 +2650,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Make ``item`` the current item. A vehicle that is flying its mission proceeds to it immediately.
 
+        A vehicle that has finished its mission stays where it is, also in its mission mode (ArduPilot), until you call
+        :meth:`resume`.
+
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
         without a position (a DO command) is executed; ``current`` then shows the item after it.
 
@@ -2676,7 +2682,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, its mode changed meanwhile, or no item is left to fly (PX4).
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
             OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
                 was busy with a transfer of plans.
@@ -4989,7 +4995,9 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait for the next HOME_POSITION after the acknowledgement.
+        """Move the home position, and wait until HOME_POSITION reports it after the acknowledgement.
+
+        While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
         COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
@@ -5003,7 +5011,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: the vehicle accepted the command, but no HOME_POSITION was received.
+            OperationTimeout: the vehicle accepted the command, but HOME_POSITION did not report the new home.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 

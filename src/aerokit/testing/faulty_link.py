@@ -99,8 +99,8 @@ class StalledQueue:
             partial(self._send_or_accept, peer=peer),
             partial(self._accepted_bytes_of, peer),
             limit=LIMIT,
-            dropped=self._on_drop,
-            stalled=partial(self._on_peer_stalled, peer),
+            on_dropped=self._on_drop,
+            on_stalled=partial(self._on_peer_stalled, peer),
         )
         if self._is_full:
             outbox.pause()

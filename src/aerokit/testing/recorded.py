@@ -18,6 +18,7 @@ from aerokit.missions.item import LOCAL_FRAMES
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.protocols.servers.ftp_packets import FtpPacket
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
@@ -77,12 +78,10 @@ class RecordedParameters(ParameterProtocolServer):
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        name_and_index = self.requested(request.param_id, request.param_index)
+        if self.send_requested(request.param_id, request.param_index, channel):
+            return
         is_by_name = request.param_index < 0
-        if name_and_index is not None:
-            name, index = name_and_index
-            self.send(name, index, channel)
-        elif is_by_name and request.param_id == HASH_NAME and self._has_hash:
+        if is_by_name and request.param_id == HASH_NAME and self._has_hash:
             self.send(HASH_NAME, UNKNOWN_INDEX, channel)
         else:
             self._refuse(request, request.param_index, channel)
@@ -180,7 +179,7 @@ class RecordedMissions(MissionServer):
         return results[min(number, len(results) - 1)]
 
 
-def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, wants_float: bool) -> AnyItem:
+def _item_message(item: AnyItem, seq: int, client: ComponentIds, *, wants_float: bool) -> AnyItem:
     """Convert a recorded item to MISSION_ITEM (``wants_float``) or MISSION_ITEM_INT."""
     # In MISSION_ITEM_INT, x and y are degrees times 1e7, in local frames metres times 1e4, and in MAV_FRAME_MISSION
     # numbers without a scale.

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Hashable
 from importlib import import_module
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkError, LinkLost, LinkOpenError
 
@@ -248,7 +248,6 @@ class BaseLink(Link):
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
-        """Notify the receiver if the link has stalled or drained."""
         stalled_since = self._stalled_at  # None if the link was not stalled until now
         if is_stalled == (stalled_since is not None):
             return
@@ -340,6 +339,11 @@ def memory_link_pair(*, latency_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]
     return near, far
 
 
+class _Arrival(NamedTuple):
+    due: float
+    data: bytes | None  # None if the far end was closed
+
+
 class MemoryLink(BaseLink):
     """One end of `memory_link_pair`."""
 
@@ -348,7 +352,7 @@ class MemoryLink(BaseLink):
         self._latency_s = latency_s
         self._far: MemoryLink | None = None  # the other end, set by `memory_link_pair`
         self._loop: asyncio.AbstractEventLoop | None = None  # None while the link is not open
-        self._inbox: deque[tuple[float, bytes | None]] = deque()  # (due time, data); data is None if the far end closed
+        self._inbox: deque[_Arrival] = deque()
         self._wake_up: asyncio.Handle | None = None  # pending call of `_arrive`
 
     def write(self, data: bytes, peer: Peer = None) -> None:
@@ -376,28 +380,27 @@ class MemoryLink(BaseLink):
             if data is not None:
                 sender.dropped_writes += 1
             return
-        self._inbox.append((self._loop.time() + self._latency_s, data))
+        self._inbox.append(_Arrival(self._loop.time() + self._latency_s, data))
         if self._wake_up is None:
             self._schedule(self._loop)
 
     def _schedule(self, loop: asyncio.AbstractEventLoop) -> None:
         if not loop.is_closed():
-            due, _ = self._inbox[0]
+            due = self._inbox[0].due
             self._wake_up = loop.call_at(due, self._arrive) if self._latency_s else loop.call_soon(self._arrive)
 
     def _arrive(self) -> None:
         self._wake_up = None
         if self._loop is None or not self._inbox:
             return
-        first_due, _ = self._inbox[0]
-        now = max(self._loop.time(), first_due)  # A timer may fire early by the clock's resolution.
+        now = max(self._loop.time(), self._inbox[0].due)  # A timer may fire early by the clock's resolution.
         # Due items are counted before the delivery. Data that the far end writes in response may be due at once, but
         # must arrive in a later iteration of the event loop. The first item is always due.
-        due_count = 1 if len(self._inbox) == 1 else sum(due <= now for due, _ in self._inbox)
+        due_count = 1 if len(self._inbox) == 1 else sum(arrival.due <= now for arrival in self._inbox)
         for _ in range(due_count):
             if not self._inbox:  # The receiver has closed the link in its callback.
                 return
-            _, data = self._inbox.popleft()
+            data = self._inbox.popleft().data
             if data is None:
                 self._lose("the other end was closed")
             else:

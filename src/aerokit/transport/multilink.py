@@ -68,17 +68,11 @@ class MultiLink(Link):
             raise InvalidArgument(f"costly = {unknown_links} is not allowed: the indices are 0 to {len(factories) - 1}")
         self.costly: frozenset[int] = frozenset(costly)
         """Indices of links that are used only when the others fail."""
-        self._factories = tuple(factories)
-        self._links = [make_link() for make_link in factories]
+        self._members = [_Member(self, index, make_link) for index, make_link in enumerate(factories)]
         self._survives_loss = survives_loss
         self._receiver: Receiver | None = None  # None before the opening and after the end, when no callback runs
         self._was_opened = self._is_closed = False
-        self._is_available = [False] * len(self._links)
-        # For each link, the peers that the receiver keeps. After a reopening, `keep_peer` is called again for them.
-        self._kept: list[set[Peer]] = [set() for _ in self._links]
         self._openings: set[asyncio.Task[None]] = set()  # tasks that retry links which could not be opened
-        # Indices of links that another connection has opened, and that must not be closed here.
-        self._foreign: set[int] = set()
         self._is_opening = False  # True while open() runs
         self._last_loss: LinkLost | None = None  # last loss of any link since the opening
         self._lost_at: float | None = None  # time since which all links are lost; None while one is available
@@ -92,28 +86,28 @@ class MultiLink(Link):
     @property
     def names(self) -> tuple[str, ...]:
         """The address of each link."""
-        return tuple(link.address for link in self._links)
+        return tuple(member.link.address for member in self._members)
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
         """Sum of `Link.dropped_writes` over all links, and the writes that no link could take."""
-        return self._dropped + sum(link.dropped_writes for link in self._links)
+        return self._dropped + sum(member.link.dropped_writes for member in self._members)
 
     @property
     def unsent_bytes(self) -> int:
-        return sum(link.unsent_bytes for link in self._links)
+        return sum(member.link.unsent_bytes for member in self._members)
 
     def discard_unsent(self) -> None:
-        for link in self._links:
-            link.discard_unsent()
+        for member in self._members:
+            member.link.discard_unsent()
 
     def discard_unsent_of(self, link: int) -> None:
         """Discard unsent data of one link, so that it does not arrive after commands over another link."""
-        self._links[link].discard_unsent()
+        self._members[link].link.discard_unsent()
 
     def is_available(self, link: int) -> bool:
         """Return True if the link with this index is open."""
-        return self._is_available[link]
+        return self._members[link].is_available
 
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`. Raises LinkOpenError with the reason of every link if no link can be opened."""
@@ -122,9 +116,8 @@ class MultiLink(Link):
         if self._was_opened:
             raise BusyError(f"{self.address} was already opened; a link can be opened only once")
         self._was_opened, self._receiver = True, receiver
-        self._foreign.clear()
         self._is_opening, self._last_loss = True, None
-        openings = [asyncio.ensure_future(self._open_one(index)) for index in range(len(self._links))]
+        openings = [asyncio.ensure_future(member.open()) for member in self._members]
         try:
             failures = await asyncio.gather(*openings)  # None for each link that was opened
             if None not in failures:
@@ -134,37 +127,38 @@ class MultiLink(Link):
             raise
         finally:
             self._is_opening = False
-        for index, failure in enumerate(failures):
+        for member, failure in zip(self._members, failures, strict=True):
             if failure is not None and not self._is_closed:
                 logger.warning("one of several links cannot be opened and is retried: %s", failure)
-                self._start_opening(index)
+                self._start_opening(member)
         self._check_all_lost()  # A link may have been lost while others were still being opened.
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`; None writes to every peer of every link."""
         if isinstance(peer, LinkPeer):
-            self._write_to(peer.link, data, peer.peer)
+            self._write_to(self._members[peer.link], data, peer.peer)
             return
-        for index in range(len(self._links)):
-            self._write_to(index, data, None)
+        for member in self._members:
+            self._write_to(member, data, None)
 
     def keep_peer(self, peer: Peer) -> None:
         if isinstance(peer, LinkPeer):
-            self._kept[peer.link].add(peer.peer)
-            self._links[peer.link].keep_peer(peer.peer)
+            self._members[peer.link].kept_peers.add(peer.peer)
+            self._members[peer.link].link.keep_peer(peer.peer)
 
     def forget_peer(self, peer: Peer) -> None:
         if isinstance(peer, LinkPeer):
-            self._kept[peer.link].discard(peer.peer)
-            self._links[peer.link].forget_peer(peer.peer)
+            self._members[peer.link].kept_peers.discard(peer.peer)
+            self._members[peer.link].link.forget_peer(peer.peer)
 
     def host_of(self, peer: Peer) -> object:
-        return self._links[peer.link].host_of(peer.peer) if isinstance(peer, LinkPeer) else peer
+        return self._members[peer.link].link.host_of(peer.peer) if isinstance(peer, LinkPeer) else peer
 
     def has_peer(self, peer: Peer) -> bool:
         if not isinstance(peer, LinkPeer):
             return True
-        return self._is_available[peer.link] and self._links[peer.link].has_peer(peer.peer)
+        member = self._members[peer.link]
+        return member.is_available and member.link.has_peer(peer.peer)
 
     def close(self) -> None:
         if not self._is_closed:
@@ -183,23 +177,9 @@ class MultiLink(Link):
 
     @property
     def _own_links(self) -> list[Link]:
-        return [link for index, link in enumerate(self._links) if index not in self._foreign]
+        return [member.link for member in self._members if member.owns_link]
 
     # ------------------------------------------------------------------------------- opening
-
-    async def _open_one(self, index: int) -> LinkOpenError | None:
-        """Open one link. Return the error if another attempt may succeed."""
-        receiver = _MemberReceiver(self, index)
-        try:
-            await self._links[index].open(receiver)
-        except LinkOpenError as error:
-            return error
-        except BusyError:  # The given link object is already used by another connection.
-            self._foreign.add(index)
-            raise
-        if not receiver.is_lost:
-            self._on_restored(index)
-        return None
 
     async def _abort_opening(self, openings: Collection[asyncio.Future[LinkOpenError | None]]) -> None:
         self._receiver = None
@@ -210,25 +190,22 @@ class MultiLink(Link):
         finally:  # The caller may be cancelled again; anyio does so at each await.
             for link in self._own_links:
                 link.close()
-            # A closed link cannot be opened again, so it is replaced.
-            for index, make_link in enumerate(self._factories):
-                if index not in self._foreign:
-                    self._links[index] = make_link()
-            self._is_available = [False] * len(self._links)
+            for member in self._members:
+                member.replace_link()
             self._was_opened = False
 
-    def _start_opening(self, index: int) -> None:
-        task = asyncio.get_running_loop().create_task(self._retry_opening(index), name="aerokit opening")
+    def _start_opening(self, member: _Member) -> None:
+        task = asyncio.get_running_loop().create_task(self._retry_opening(member), name="aerokit opening")
         self._openings.add(task)
         task.add_done_callback(self._openings.discard)
 
-    async def _retry_opening(self, index: int) -> None:
+    async def _retry_opening(self, member: _Member) -> None:
         backoff = Backoff()
         is_reported = False
         while not self._is_closed:
             await asyncio.sleep(backoff.next_delay())
             try:
-                error = await self._open_one(index)
+                error = await member.open()
             except Exception as failure:  # e.g. another connection has opened the link meanwhile
                 logger.warning("one of several links is given up: %s", failure)
                 return
@@ -239,17 +216,12 @@ class MultiLink(Link):
             # first failed retry is reported instead.
             if not is_reported and isinstance(self._receiver, MemberLinkListener):
                 is_reported = True
-                self._receiver.member_link_open_failed(index, error)
+                self._receiver.member_link_open_failed(member.index, error)
 
     # ------------------------------------------------------------ callbacks of the links
 
-    def _on_bytes(self, index: int, data: bytes, peer: Peer) -> None:
-        if self._receiver is not None:
-            self._receiver.bytes_received(data, LinkPeer(index, peer))
-
-    def _on_lost(self, index: int, error: LinkLost) -> None:
-        self._is_available[index] = False
-        self._notify_availability(index)
+    def _on_lost(self, member: _Member, error: LinkLost) -> None:
+        self._notify_availability(member)
         self._last_loss = error
         self._check_all_lost()
 
@@ -258,7 +230,7 @@ class MultiLink(Link):
         receiver, error = self._receiver, self._last_loss
         if error is None or receiver is None or self._is_opening:
             return
-        if any(self._is_available) or self._lost_at is not None:
+        if any(member.is_available for member in self._members) or self._lost_at is not None:
             return
         if self._survives_loss and self._may_come_back:
             self._lost_at = asyncio.get_running_loop().time()
@@ -272,11 +244,8 @@ class MultiLink(Link):
         lost.__cause__ = error
         receiver.link_lost(lost)
 
-    def _on_restored(self, index: int) -> None:
-        self._is_available[index] = True
-        for peer in self._kept[index]:
-            self._links[index].keep_peer(peer)
-        self._notify_availability(index)
+    def _on_restored(self, member: _Member) -> None:
+        self._notify_availability(member)
         if self._lost_at is not None:
             away_s = asyncio.get_running_loop().time() - self._lost_at
             self._lost_at = None
@@ -287,50 +256,83 @@ class MultiLink(Link):
         if isinstance(self._receiver, MemberLinkListener):
             self._receiver.member_link_stalled(index, is_stalled)
 
-    def _notify_availability(self, index: int) -> None:
+    def _notify_availability(self, member: _Member) -> None:
         if isinstance(self._receiver, MemberLinkListener):
-            self._receiver.member_link_changed(index, self._is_available[index])
+            self._receiver.member_link_changed(member.index, member.is_available)
 
     @property
     def _may_come_back(self) -> bool:
-        return bool(self._openings) or any(isinstance(link, ReconnectingLink) for link in self._links)
+        return bool(self._openings) or any(isinstance(member.link, ReconnectingLink) for member in self._members)
 
-    def _write_to(self, index: int, data: bytes, peer: Peer) -> None:
-        if self._is_available[index]:
-            self._links[index].write(data, peer)
+    def _write_to(self, member: _Member, data: bytes, peer: Peer) -> None:
+        if member.is_available:
+            member.link.write(data, peer)
         elif self._receiver is not None:
             self._dropped += 1
 
 
-class _MemberReceiver:
-    """Receiver of one link; forwards callbacks to the `MultiLink`."""
+class _Member:
+    """One link of a `MultiLink`, and the receiver of its callbacks."""
 
-    def __init__(self, owner: MultiLink, index: int) -> None:
-        self._owner, self._index = owner, index
-        self.keeps_peers = owner._receiver is not None and keeps_peers(owner._receiver)
-        self.is_lost = False
+    def __init__(self, owner: MultiLink, index: int, make_link: Callable[[], Link]) -> None:
+        self._owner, self._make_link = owner, make_link
+        self.index = index
+        self.link = make_link()
+        self.is_available = False  # True while the link is open
+        self.owns_link = True  # False if another connection has opened the link, which must not be closed here
+        self.kept_peers: set[Peer] = set()  # After a reopening, `keep_peer` is called again for them.
+        self.keeps_peers = False  # see `PeerKeeper`
+        self._is_lost = False
+
+    async def open(self) -> LinkOpenError | None:
+        """Open the link. Return the error if another attempt may succeed."""
+        receiver = self._owner._receiver
+        self.keeps_peers = receiver is not None and keeps_peers(receiver)
+        self._is_lost, self.owns_link = False, True
+        try:
+            await self.link.open(self)
+        except LinkOpenError as error:
+            return error
+        except BusyError:  # The given link object is already used by another connection.
+            self.owns_link = False
+            raise
+        if not self._is_lost:
+            self._set_available()
+        return None
+
+    def replace_link(self) -> None:
+        """Make a new link, because a closed link cannot be opened again."""
+        if self.owns_link:
+            self.link = self._make_link()
+        self.is_available = False
+
+    def _set_available(self) -> None:
+        self.is_available = True
+        for peer in self.kept_peers:
+            self.link.keep_peer(peer)
+        self._owner._on_restored(self)
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        self._owner._on_bytes(self._index, data, peer)
+        if self._owner._receiver is not None:
+            self._owner._receiver.bytes_received(data, LinkPeer(self.index, peer))
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        self._owner._on_stalled(self._index, True)
+        self._owner._on_stalled(self.index, True)
 
     def link_drained(self, stalled_s: float) -> None:
-        self._owner._on_stalled(self._index, False)
+        self._owner._on_stalled(self.index, False)
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         if isinstance(self._owner._receiver, OrderRefusalListener):
             self._owner._receiver.order_refused(message, reason, lease_holder, answers)
 
     def link_interrupted(self, error: LinkLost) -> None:
-        self.is_lost = True
-        self._owner._on_lost(self._index, error)
+        self.link_lost(error)
 
     def link_restored(self, away_s: float) -> None:
-        self.is_lost = False
-        self._owner._on_restored(self._index)
+        self._is_lost = False
+        self._set_available()
 
     def link_lost(self, error: LinkLost) -> None:
-        self.is_lost = True
-        self._owner._on_lost(self._index, error)
+        self._is_lost, self.is_available = True, False
+        self._owner._on_lost(self, error)

@@ -7,6 +7,7 @@ import contextlib
 import sys
 from collections import deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 WRITE_TIMEOUT_S = 1.0
 """Seconds after which waiting data is dropped, because a late command is worse than none."""
@@ -16,6 +17,11 @@ STALLED_AFTER_S = 1.0
 
 _POLL_INTERVAL_S = 0.25
 _MAX_JOINED_BYTES = 1024  # Small frames that have waited are combined into writes of up to this size.
+
+
+class _WaitingWrite(NamedTuple):
+    deadline: float
+    data: bytes
 
 
 class Outbox:
@@ -28,8 +34,8 @@ class Outbox:
         send: writes bytes to the transport.
         pending: returns the number of unsent bytes in the transport and the kernel.
         limit: maximum number of buffered bytes.
-        dropped: called with the number of dropped writes.
-        stalled: called with True when no waiting data has left for `STALLED_AFTER_S`, with False when it leaves again.
+        on_dropped: called with the number of dropped writes.
+        on_stalled: called with True when waiting data stays for `STALLED_AFTER_S`, with False when it leaves again.
     """
 
     def __init__(
@@ -38,13 +44,13 @@ class Outbox:
         pending: Callable[[], int],
         *,
         limit: int,
-        dropped: Callable[[int], object],
-        stalled: Callable[[bool], object],
+        on_dropped: Callable[[int], object],
+        on_stalled: Callable[[bool], object],
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._send, self._pending, self._limit = send, pending, limit
-        self._on_dropped, self._on_stalled = dropped, stalled
-        self._waiting: deque[tuple[float, bytes]] = deque()  # (deadline, frame)
+        self._on_dropped, self._on_stalled = on_dropped, on_stalled
+        self._waiting: deque[_WaitingWrite] = deque()
         self._waiting_bytes = 0
         self._forwarded_bytes = 0  # number of bytes written to the transport
         self._sent_bytes = 0  # number of bytes that had left this machine at the last poll
@@ -98,7 +104,7 @@ class Outbox:
         self._forwarded_bytes -= count
 
     def close(self) -> None:
-        """Forward waiting data, or drop it if the transport is stalled. Afterwards, ``stalled`` is not called."""
+        """Forward waiting data, or drop it if the transport is stalled. Afterwards, ``on_stalled`` is not called."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -114,7 +120,7 @@ class Outbox:
         if self._waiting and self._waiting_bytes + len(data) > self._limit:
             self._on_dropped(1)
             return
-        self._waiting.append((self._loop.time() + WRITE_TIMEOUT_S, data))
+        self._waiting.append(_WaitingWrite(self._loop.time() + WRITE_TIMEOUT_S, data))
         self._waiting_bytes += len(data)
 
     def _forward(self, data: bytes) -> None:
@@ -129,21 +135,18 @@ class Outbox:
     def _take_joined(self) -> bytes:
         """Remove the next write and return it, joined with the writes that follow."""
         joined = self._pop_oldest()
-        while self._waiting:
-            _, next_write = self._waiting[0]
-            if len(joined) + len(next_write) > _MAX_JOINED_BYTES:
-                break
+        while self._waiting and len(joined) + len(self._waiting[0].data) <= _MAX_JOINED_BYTES:
             joined += self._pop_oldest()
         return joined
 
     def _pop_oldest(self) -> bytes:
-        _, data = self._waiting.popleft()
+        data = self._waiting.popleft().data
         self._waiting_bytes -= len(data)
         return data
 
     def _drop_outdated(self) -> None:
         now = self._loop.time()
-        outdated = sum(deadline <= now for deadline, _ in self._waiting)  # The deadlines are in order.
+        outdated = sum(write.deadline <= now for write in self._waiting)  # The deadlines are in order.
         for _ in range(outdated):
             self._pop_oldest()
         if outdated:

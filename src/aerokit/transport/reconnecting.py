@@ -189,11 +189,6 @@ class ReconnectingLink(Link):
         if current is self._current and self._receiver is not None:
             self._receiver.bytes_received(data, peer)
 
-    def _drain_listener(self, current: _CurrentReceiver) -> DrainListener | None:
-        if current is self._current and isinstance(self._receiver, DrainListener):
-            return self._receiver
-        return None
-
     def _on_lost(self, current: _CurrentReceiver, error: LinkLost) -> None:
         if current is not self._current:
             return
@@ -280,42 +275,41 @@ class _CurrentReceiver:
 
     def __init__(self, owner: ReconnectingLink) -> None:
         self._owner = owner
-        self.keeps_peers = owner._receiver is not None and keeps_peers(owner._receiver)
         receiver = owner._receiver
+        self.keeps_peers = receiver is not None and keeps_peers(receiver)
         self._burst_listener = receiver if isinstance(receiver, BurstListener) else None
         self.is_lost = False
+
+    @property
+    def _receiver(self) -> Receiver | None:
+        return self._owner._receiver if self is self._owner._current else None
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         self._owner._on_bytes(self, data, peer)
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        if listener := self._owner._drain_listener(self):
-            listener.link_stalled(unsent_bytes)
+        if isinstance(receiver := self._receiver, DrainListener):
+            receiver.link_stalled(unsent_bytes)
 
     def link_drained(self, stalled_s: float) -> None:
-        if listener := self._owner._drain_listener(self):
-            listener.link_drained(stalled_s)
+        if isinstance(receiver := self._receiver, DrainListener):
+            receiver.link_drained(stalled_s)
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
-        receiver = self._owner._receiver
-        if self is self._owner._current and isinstance(receiver, OrderRefusalListener):
+        if isinstance(receiver := self._receiver, OrderRefusalListener):
             receiver.order_refused(message, reason, lease_holder, answers)
 
     def burst_ended(self) -> None:
-        if self._burst_listener is not None and self is self._owner._current and self._owner._receiver is not None:
+        if self._burst_listener is not None and self._receiver is not None:
             self._burst_listener.burst_ended()
 
     def peer_joined(self, peer: Peer) -> None:
-        if listener := self._peer_listener():
-            listener.peer_joined(peer)
+        if isinstance(receiver := self._receiver, PeerListener):
+            receiver.peer_joined(peer)
 
     def peer_left(self, peer: Peer) -> None:
-        if listener := self._peer_listener():
-            listener.peer_left(peer)
-
-    def _peer_listener(self) -> PeerListener | None:
-        receiver = self._owner._receiver if self is self._owner._current else None
-        return receiver if isinstance(receiver, PeerListener) else None
+        if isinstance(receiver := self._receiver, PeerListener):
+            receiver.peer_left(peer)
 
     def link_lost(self, error: LinkLost) -> None:
         self.is_lost = True

@@ -102,8 +102,8 @@ class SerialLink(BaseLink):
             self._transport.write,
             partial(self._waiting_to_be_sent, self._transport),
             limit=limit,
-            dropped=self._drop,
-            stalled=self._report_stalled,
+            on_dropped=self._drop,
+            on_stalled=self._report_stalled,
         )
 
     def _open_port(self) -> tuple[Any, Any]:
@@ -277,17 +277,16 @@ class PtyLink(BaseLink):
     def __init__(self, path: str = "") -> None:
         super().__init__(f"pty:{path}" if path else "pty")
         self._path = path
-        self._ends: tuple[int, ...] = ()  # file descriptors: our end, the other end
+        self._our_end = self._other_end = -1  # file descriptors; −1 while the link is not open
         self._loop: asyncio.AbstractEventLoop | None = None
         self._has_symlink = False  # True while `_path` is a symbolic link that this link has made
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. Data that does not fit into the kernel's buffer is dropped."""
-        if not self._ends or not data:
+        if self._our_end < 0 or not data:
             return
         try:
-            our_end, _ = self._ends
-            written = os.write(our_end, data)
+            written = os.write(self._our_end, data)
         except OSError:
             written = 0
         if written < len(data):
@@ -300,16 +299,15 @@ class PtyLink(BaseLink):
 
         self._loop = asyncio.get_running_loop()
         # The other end is kept open here, because reading our end fails while no process has the other end open.
-        ours, theirs = os.openpty()
-        self._ends = ours, theirs
-        tty.setraw(theirs)
-        os.set_blocking(ours, False)
-        name = os.ttyname(theirs)
+        self._our_end, self._other_end = os.openpty()
+        tty.setraw(self._other_end)
+        os.set_blocking(self._our_end, False)
+        name = os.ttyname(self._other_end)
         if self._path:
             self._make_symlink(name)
         self.address: str = f"pty:{self._path or name}"
         self._released.clear()
-        self._loop.add_reader(ours, self._read)
+        self._loop.add_reader(self._our_end, self._read)
 
     def _make_symlink(self, target: str) -> None:
         """Make the symbolic link. Raises OSError if a file exists at its path."""
@@ -320,9 +318,8 @@ class PtyLink(BaseLink):
         self._has_symlink = True
 
     def _read(self) -> None:
-        our_end, _ = self._ends
         try:
-            data = os.read(our_end, _READ_SIZE)
+            data = os.read(self._our_end, _READ_SIZE)
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -331,12 +328,12 @@ class PtyLink(BaseLink):
         self._deliver(data)
 
     def _release(self) -> None:
-        ends, self._ends = self._ends, ()
-        if self._loop is not None and ends and not self._loop.is_closed():
-            our_end, _ = ends
-            self._loop.remove_reader(our_end)
-        for end in ends:
-            os.close(end)
+        if self._our_end >= 0:
+            if self._loop is not None and not self._loop.is_closed():
+                self._loop.remove_reader(self._our_end)
+            os.close(self._our_end)
+            os.close(self._other_end)
+            self._our_end = self._other_end = -1
         if self._has_symlink:
             self._has_symlink = False
             with contextlib.suppress(OSError):

@@ -120,7 +120,6 @@ class TcpConnect(_TcpLink):
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
-        """Connect to the first address that accepts."""
         first_error: OSError | None = None
         for address in addresses:
             try:
@@ -347,8 +346,8 @@ class _Stream(asyncio.Protocol):
             transport.write,
             self._pending,
             limit=MAX_PENDING_BYTES,
-            dropped=self._link._drop,
-            stalled=lambda is_stalled: self._link._on_stalled(self, is_stalled),
+            on_dropped=self._link._drop,
+            on_stalled=lambda is_stalled: self._link._on_stalled(self, is_stalled),
         )
         self._link._add_stream(self)
 

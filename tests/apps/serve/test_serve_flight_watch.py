@@ -14,6 +14,7 @@ from serve_stage import Stage, open_stage
 import aerokit
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.mavlink.enums import MavLandedState, MavType
+from aerokit.position import Position
 from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.vehicle.state.movement import Velocity
 
@@ -158,6 +159,7 @@ class FakeFlight:
 
     def __init__(self) -> None:
         self.now = 100.0
+        self.home_m = 488.0
         self.velocity, self.position = FakeCell(), FakeCell()
         self.armed, self.landed_state = FakeCell(True), FakeCell(MavLandedState.IN_AIR)
         self.telemetry = SimpleNamespace(velocity=self.velocity, position=self.position)
@@ -172,7 +174,9 @@ class FakeFlight:
         found = False
         for height_m, sink_m_s in path:
             self.now += STEP_S
-            self.position.set(SimpleNamespace(altitude_relative_m=height_m), self.now)
+            altitude_m = 488.0 + height_m
+            relative_m = altitude_m - self.home_m
+            self.position.set(Position(47.0, 8.0, altitude_m, altitude_relative_m=relative_m), self.now)
             self.velocity.set(Velocity(north_m_s, 0.0, sink_m_s), self.now)
             found = found or self.watch.crash is not None
         return found
@@ -266,6 +270,17 @@ def test_crashed_vehicle_that_takes_off_slowly_is_no_longer_crashed(reports_land
         flight.landed_state.set(MavLandedState.IN_AIR, flight.now)
     flight.fly([(climb_m_s * STEP_S * step, -climb_m_s) for step in range(10 * seconds)])
     assert not flight.fly([(climb_m_s * seconds, 0.0)] * 50)
+
+
+def test_crash_is_kept_when_home_moves() -> None:
+    """PX4 corrects the altitude of home in flight. With running motors, a crashed vehicle may report take-offs."""
+    flight = FakeFlight()
+    assert flight.fly(sinking(40, 90.0, 0.0))
+    flight.landed_state.set(MavLandedState.ON_GROUND, flight.now)
+    flight.landed_state.set(MavLandedState.IN_AIR, flight.now)
+    flight.home_m -= 1.0
+    flight.fly([(0.0, 0.0)] * 50)
+    assert flight.watch.crash is not None
 
 
 def test_crashed_vehicle_with_changing_landed_state_stays_crashed() -> None:

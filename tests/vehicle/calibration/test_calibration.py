@@ -255,6 +255,18 @@ async def test_lost_cancel_is_repeated(kind: type[Any]) -> None:
         assert len([params for params in orders(wire, CANCELS[kind][0]) if not any(params)]) >= 3
 
 
+async def test_lost_cancel_is_repeated_despite_newer_action() -> None:
+    async with stage(SimulatedCopter) as (copter, vehicle, _):
+        calibration = vehicle.calibrate.compass()
+        await calibration.__anext__()
+        copter.faults.ignore(MavCmd.DO_CANCEL_MAG_CAL, times=1)
+        cancelling = asyncio.create_task(calibration.cancel())
+        await anyio.sleep(0.5)
+        await vehicle.set_mode("LOITER")
+        await cancelling
+        assert not is_running(copter)
+
+
 async def test_unconfirmed_cancel_is_sent_six_times_and_raises() -> None:
     async with stage(SimulatedCopter) as (copter, vehicle, wire):
         calibration = vehicle.calibrate.compass()

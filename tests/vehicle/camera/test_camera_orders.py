@@ -416,6 +416,26 @@ async def test_stop_of_cancelled_series_is_repeated_after_silence() -> None:
         assert not camera.captures.is_busy
 
 
+async def test_lost_stop_of_series_is_repeated_despite_flight_orders() -> None:
+    camera = SimulatedCamera()
+    copter = SimulatedCopter(boot_time_s=0.0, components=(camera,))
+    async with open_flight(copter) as flight, anyio.create_task_group() as tasks:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.camera.wait_found()
+
+        async def steer() -> None:
+            for mode in ("LOITER", "ALT_HOLD", "LOITER"):
+                await anyio.sleep(0.3)
+                await flight.vehicle.set_mode(mode)
+
+        async with flight.vehicle.camera.photo_interval(1.0):
+            await anyio.sleep(2.0)
+            camera.faults.ignore(STOP, times=1)
+            tasks.start_soon(steer)
+        await anyio.sleep(5.0)
+        assert not camera.captures.is_busy
+
+
 async def test_order_is_not_resent_to_silent_camera() -> None:
     """The autopilot's HEARTBEAT does not count for a camera with a component id of its own."""
     camera = SimulatedCamera()
@@ -429,7 +449,7 @@ async def test_order_is_not_resent_to_silent_camera() -> None:
 
         camera.faults.silent = True
         await anyio.sleep(10)
-        with pytest.raises(CommandTimeout, match="no HEARTBEAT received since"):
+        with pytest.raises(CommandTimeout, match="no HEARTBEAT of component 100 received since"):
             await flight.vehicle.camera.zoom_to(50)
         assert sent() == 1
         camera.faults.silent = False

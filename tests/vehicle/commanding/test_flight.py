@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import anyio
@@ -855,8 +856,52 @@ async def test_set_home_without_requested_message_succeeds(flying: Flight, name:
     getattr(flying.copter.faults, name)(MavCmd.REQUEST_MESSAGE)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(flying.vehicle.set_home)
-        await anyio.sleep(6.0)
+        await anyio.sleep(4.0)
         flying.copter.send_built(m.HomePosition.ID)
+
+
+async def test_set_home_waits_for_report_of_new_home(flying: Flight) -> None:
+    """A HOME_POSITION that is older than the order may arrive after the acknowledgement."""
+    copter, home = flying.copter, flying.vehicle.home.value
+    old_report = copter.build(m.HomePosition.ID)
+    assert old_report is not None
+    place = home.position.offset(north_m=30.0).replace(altitude_amsl_m=home.altitude_amsl_m)
+    copter.faults.refuse(MavCmd.REQUEST_MESSAGE)
+    copter.faults.lose(m.HomePosition)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(flying.vehicle.set_home, place)
+        await anyio.sleep(1.0)
+        copter.send(old_report)
+        await anyio.sleep(1.0)
+        copter.send_built(m.HomePosition.ID)
+    assert flying.vehicle.home.value.position.distance_to(place) < 0.1
+
+
+async def test_take_off_reaches_its_altitude_when_home_is_moved(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(partial(vehicle.take_off, 10.0, timeout=30.0))
+        await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0.0) > 5.0)
+        await vehicle.set_home()
+    assert -grounded.copter.motion.down == pytest.approx(10.0, abs=0.6)
+    assert (vehicle.position.value.altitude_relative_m or 0.0) < 6.0
+
+
+async def test_set_home_requests_lost_report_again(flying: Flight) -> None:
+    flying.copter.faults.lose(m.HomePosition, times=3)
+    await flying.vehicle.set_home()
+    assert flying.copter.faults.lost_messages[m.HomePosition.ID] == 0
+
+
+async def test_set_home_reports_home_that_stays(flying: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    """PX4 may replace the ordered home by its own position at once (HomePosition.cpp)."""
+    monkeypatch.setattr(flying.copter.navigation, "set_home", lambda *_, **__: None)
+    home = flying.vehicle.home.value
+    place = home.position.offset(north_m=30.0).replace(altitude_amsl_m=home.altitude_amsl_m)
+    with pytest.raises(OperationTimeout, match=r"^set_home: not reached within 5 s; home is Home"):
+        await flying.vehicle.set_home(place)
 
 
 async def test_look_at_refused(flying: Flight) -> None:

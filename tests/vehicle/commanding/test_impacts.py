@@ -236,3 +236,26 @@ async def test_impact_needs_lost_height_and_low_speed(drop_m: float, ground_spee
             detector.update()
             await anyio.sleep(0.1)
         assert bool(detector.describe()) is is_impact
+
+
+@pytest.mark.parametrize(("in_fall_m", "after_impact_m"), [(6.0, 0.0), (0.0, 4.0)])
+async def test_moving_home_hides_no_impact(in_fall_m: float, after_impact_m: float) -> None:
+    """PX4 corrects the altitude of home in flight: the height above home then changes without a movement."""
+    async with in_the_air(20.0) as flight:
+        flight.copter.faults.silent = True
+        telemetry = flight.vehicle.telemetry
+        detector = ImpactDetector(telemetry)
+        here = place_of(flight)
+        relative_m = here.altitude_relative_m or 0.0
+        for sink_m_s in [*[0.0] * 10, 4.0, 8.0, 8.0, *[0.0] * 5]:
+            here = here.offset(up_m=-2.0 if sink_m_s else 0.0)
+            relative_m += in_fall_m / 3 - 2.0 if sink_m_s else 0.0
+            telemetry.position.set(here.replace(altitude_relative_m=relative_m), Source(1, 1, "the test"))
+            telemetry.velocity.set(Velocity(0.0, 0.0, sink_m_s), Source(1, 1, "the test"))
+            detector.update()
+            await anyio.sleep(0.1)
+        await anyio.sleep(0.5)
+        telemetry.position.set(here.replace(altitude_relative_m=relative_m + after_impact_m), Source(1, 1, "the test"))
+        telemetry.velocity.set(Velocity(0.0, 0.0, 0.0), Source(1, 1, "the test"))
+        detector.update()
+        assert detector.describe()

@@ -333,3 +333,25 @@ async def test_abandoned_arming_before_newer_mode_is_undone(grounded: Flight) ->
     await anyio.sleep(5.0)
     assert ordered(grounded) == [1, 0]
     assert not grounded.copter.is_armed
+
+
+@pytest.mark.parametrize("is_abandoned", [True, False])
+async def test_disarm_is_repeated_after_answer_to_earlier_arm(grounded: Flight, is_abandoned: bool) -> None:
+    """A link that duplicates frames makes the vehicle answer the command to arm twice."""
+    vehicle, copter = grounded.vehicle, grounded.copter
+    await vehicle.set_mode("GUIDED")
+    if is_abandoned:
+        with anyio.move_on_after(0.0):
+            await vehicle.arm()
+    else:
+        await vehicle.arm()
+    copter.faults.ignore(ARM, times=1)
+    async with anyio.create_task_group() as tasks:
+        if not is_abandoned:
+            tasks.start_soon(vehicle.disarm)
+        while 0 not in ordered(grounded):  # noqa: ASYNC110
+            await anyio.sleep(0.01)
+        copter.send(CommandAck(ARM, MavResult.ACCEPTED, target_system=255, target_component=190))
+        await anyio.sleep(4.0)
+    assert ordered(grounded) == [1, 0, 0]
+    assert not copter.is_armed

@@ -11,7 +11,7 @@ import pytest
 from disturbed_link import Disturbances, DisturbedLink
 
 import aerokit
-from aerokit.errors import AerokitError, SetpointStreamStopped
+from aerokit.errors import AerokitError, CommandTimeout, OperationRejected, SetpointStreamStopped
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.mavlink.messages import (
     CommandInt,
@@ -185,3 +185,71 @@ async def test_stream_replaced_by_newer_order_names_the_order() -> None:
                 await vehicle.set_mode("LOITER")
                 stream.set(VelocitySetpoint())
                 await anyio.sleep(1)
+
+
+async def test_flight_order_replaced_before_acknowledgement_is_rejected() -> None:
+    async with _copter(flies=True) as (_, vehicle, path), anyio.create_task_group() as tasks:
+        _prepare(path, Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=1, lost_commands=1))
+
+        async def go_to() -> None:
+            await anyio.sleep(0.3)
+            await vehicle.go_to(vehicle.position.value.offset(north_m=8))
+
+        tasks.start_soon(go_to)
+        with pytest.raises(OperationRejected, match=r"no COMMAND_ACK for MAV_CMD_DO_SET_MODE.*another order was given"):
+            await vehicle.set_mode("LOITER")
+
+
+async def test_arm_replaced_by_disarm_promises_no_cleanup() -> None:
+    async with _copter(flies=False) as (copter, vehicle, _), anyio.create_task_group() as tasks:
+        copter.faults.ignore(MavCmd.COMPONENT_ARM_DISARM, times=1)
+
+        async def disarm() -> None:
+            await anyio.sleep(0.3)
+            await vehicle.disarm()
+
+        tasks.start_soon(disarm)
+        with pytest.raises(OperationRejected, match=r"no COMMAND_ACK.*another order was given") as raised:
+            await vehicle.arm()
+        assert "aerokit disarms it" not in str(raised.value)
+
+
+async def test_arm_ended_by_flight_order_is_watched() -> None:
+    async with _copter(flies=False) as (copter, vehicle, _), anyio.create_task_group() as tasks:
+        copter.faults.ignore(MavCmd.COMPONENT_ARM_DISARM, times=1)
+
+        async def set_mode() -> None:
+            await anyio.sleep(0.3)
+            await vehicle.set_mode("LOITER")
+
+        tasks.start_soon(set_mode)
+        with pytest.raises(CommandTimeout, match=r"another order was given.*aerokit disarms it"):
+            await vehicle.arm()
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+async def test_unacknowledged_reboot_returns_when_vehicle_has_rebooted(is_replaced: bool) -> None:
+    async with _copter(flies=False) as (copter, vehicle, _), anyio.create_task_group() as tasks:
+        copter.faults.lose_ack(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN)
+
+        async def set_mode() -> None:
+            await anyio.sleep(0.1)
+            await _ended(vehicle.set_mode("LOITER"))
+
+        if is_replaced:
+            tasks.start_soon(set_mode)
+        uptime = copter.uptime
+        await vehicle.reboot()
+        assert copter.uptime < uptime
+
+
+async def test_raw_command_awaits_late_acknowledgement_despite_newer_action() -> None:
+    async with _copter(flies=False) as (copter, vehicle, _), anyio.create_task_group() as tasks:
+        copter.faults.delay_ack(MavCmd.DO_SET_RELAY, 2.0)
+
+        async def set_mode() -> None:
+            await anyio.sleep(0.3)
+            await vehicle.set_mode("LOITER")
+
+        tasks.start_soon(set_mode)
+        await vehicle.command(MavCmd.DO_SET_RELAY, 0, 1)

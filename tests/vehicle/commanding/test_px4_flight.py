@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 
@@ -158,7 +159,7 @@ async def turn_east(vehicle: Vehicle) -> None:
 async def go_to_as_dronekit(vehicle: Vehicle) -> None:
     home = vehicle.home.value
     latitude, longitude = round(home.latitude_deg * 1e7), round(home.longitude_deg * 1e7)
-    await flight_orders.go_to(vehicle, latitude, longitude, home.altitude_amsl_m + 10.0)
+    await flight_orders.go_to(vehicle, flight_orders.Target(latitude, longitude, home.altitude_amsl_m + 10.0))
 
 
 @pytest.mark.parametrize("order", [go_to_10_m_north, turn_east, go_to_as_dronekit])
@@ -178,6 +179,23 @@ async def test_go_to_arrives_at_ordered_altitude_when_home_moves(flying: Px4Flig
     asyncio.get_running_loop().call_later(2.0, move_home_up, flying, 4.0)
     await flying.vehicle.go_to(target, timeout=60.0)
     assert -flying.px4.motion.down == pytest.approx(15.0, abs=1.5)
+
+
+async def keep_moving_home(flight: Px4Flight) -> None:
+    """Correct the altitude of home once a second, as real PX4 does."""
+    for error_m in itertools.cycle((1.5, -1.5)):
+        await anyio.sleep(1.0)
+        move_home_up(flight, error_m)
+
+
+async def test_stalled_go_to_fails_although_home_moves(flying: Px4Flight) -> None:
+    target = north_of_home(flying, 30.0)
+    flying.px4.flight.go = lambda: None  # type: ignore[method-assign]  # The vehicle stays where it is.
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(keep_moving_home, flying)
+        with pytest.raises(OperationTimeout, match=r"has not moved for 1[23] s; the vehicle is 3\d"):
+            await flying.vehicle.go_to(target, timeout=90.0)
+        tasks.cancel_scope.cancel()
 
 
 async def test_px4_go_to_cancelled_stops_in_place(flying: Px4Flight) -> None:

@@ -149,6 +149,17 @@ async def test_pilot_while_parameters_are_read_keeps_vehicle() -> None:
         assert not flight.wire.all(m.ManualControl)
 
 
+async def test_sticks_again_after_cancellation_accept_own_late_hold() -> None:
+    """HEARTBEAT reports the hold of the first stream while the second one reads parameters."""
+    async with in_the_air(latency_s=0.3) as flight:
+        with anyio.move_on_after(4.0):
+            async with flight.vehicle.sticks() as sticks:
+                await sticks.move(FORWARD, 60.0)
+        async with flight.vehicle.sticks() as sticks:
+            await sticks.move(FORWARD, 4.0)
+            assert flight.copter.motion.velocity_north > 1.0
+
+
 @pytest.mark.parametrize("source", [0.0, 4.0])
 async def test_px4_ignoring_mavlink_sticks_raises(source: float) -> None:
     async with open_px4() as flight:

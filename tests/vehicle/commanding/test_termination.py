@@ -53,6 +53,20 @@ async def test_terminate_ignores_states_before_the_command() -> None:
             await flight.vehicle.terminate(intent="terminate flight", timeout=3.0)
 
 
+async def test_terminate_unanswered_and_replaced_may_have_been_executed() -> None:
+    async with in_the_air() as flight, anyio.create_task_group() as tasks:
+        flight.copter.faults.ignore(TERMINATE)
+
+        async def hold() -> None:
+            await anyio.sleep(0.5)
+            await flight.vehicle.hold()
+
+        tasks.start_soon(hold)
+        text = "no COMMAND_ACK .*another order was given.*may have been terminated nevertheless"
+        with pytest.raises(OperationRejected, match=text):
+            await flight.vehicle.terminate(intent="terminate flight")
+
+
 async def test_terminate_unanswered_is_sent_once() -> None:
     async with in_the_air() as flight:
         flight.copter.faults.ignore(TERMINATE)

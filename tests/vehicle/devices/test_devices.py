@@ -141,6 +141,15 @@ async def test_call_ends_with_vehicle_although_connection_stays(name: str) -> No
             call.result()
 
 
+@pytest.mark.parametrize("rate_m_s", [-0.5, 0.5])
+@pytest.mark.parametrize("length_m", [-2.0, 2.0])
+async def test_winch_pays_out_while_it_turns(length_m: float, rate_m_s: float) -> None:
+    async with on_ground(latency_s=0.3) as flight:
+        await flight.vehicle.winch().set_rate(rate_m_s)
+        await flight.vehicle.winch().pay_out(length_m, timeout=10)
+        assert flight.copter.devices.line_rate_m_s == 0
+
+
 async def test_winch_newer_order_ends_wait_for_previous() -> None:
     async with on_ground() as flight, anyio.create_task_group() as tasks:
 

@@ -33,6 +33,33 @@ async def test_winch_stop_before_pay_out_was_sent_stands() -> None:
         assert [each[1] for each in params(flight, C.DO_WINCH)] == [2]
 
 
+async def test_unrepeated_order_awaits_late_acknowledgement_despite_flight_order() -> None:
+    async with open_flight(fitted_copter()) as flight, anyio.create_task_group() as tasks:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.delay_ack(C.DO_GRIPPER, 2.0)
+
+        async def steer() -> None:
+            await anyio.sleep(0.3)
+            await flight.vehicle.set_mode("LOITER")
+
+        tasks.start_soon(steer)
+        await flight.vehicle.gripper().release()
+
+
+async def test_winch_order_replaced_before_acknowledgement_is_rejected() -> None:
+    async with open_flight(fitted_copter()) as flight, anyio.create_task_group() as tasks:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.ignore(C.DO_WINCH, times=1)
+
+        async def stop() -> None:
+            await anyio.sleep(0.5)
+            await flight.vehicle.winch().set_rate(0)
+
+        tasks.start_soon(stop)
+        with pytest.raises(OperationRejected, match=r"no COMMAND_ACK for MAV_CMD_DO_WINCH.*another order was given"):
+            await flight.vehicle.winch().set_rate(0.3)
+
+
 @pytest.mark.parametrize("after_s", [0.01, 0.35, 0.55])
 async def test_escs_cancelled_do_not_calibrate_at_next_boot(after_s: float) -> None:
     async with open_flight(fitted_copter(), latency_s=0.3) as flight:

@@ -440,6 +440,33 @@ async def test_rates_cancelled_end_with_zero_without_waiting(how: str) -> None:
             stream.set(1.0, 1.0)
 
 
+async def test_control_lost_while_zero_rate_is_sent_raises() -> None:
+    """The other station's gimbal goes on turning."""
+    gimbal = SimulatedGimbal()
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
+        with pytest.raises(GimbalTaken, match="254/190 has control now"):
+            async with flight.vehicle.gimbal.rates(0.0, 5.0):
+                await anyio.sleep(0.5)
+                gimbal.faults.ignore(PITCHYAW)
+                asyncio.get_running_loop().call_later(0.2, takes_control, flight)
+
+
+async def test_lost_zero_rate_is_repeated_despite_newer_flight_order() -> None:
+    gimbal = SimulatedGimbal()
+    async with with_gimbals(gimbal) as flight:
+        with pytest.raises(Boom):
+            async with flight.vehicle.gimbal.rates(0.0, 5.0):
+                await anyio.sleep(0.5)
+                gimbal.faults.ignore(PITCHYAW, times=1)
+                raise Boom
+        await anyio.sleep(0.1)
+        await flight.vehicle.set_mode("LOITER")
+        await anyio.sleep(3.0)
+        here = gimbal.angles()
+        await anyio.sleep(2.0)
+        assert gimbal.angles() == here
+
+
 async def test_unanswered_first_rates_end_with_zero() -> None:
     gimbal = SimulatedGimbal()
     async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():

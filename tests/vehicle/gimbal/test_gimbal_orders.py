@@ -8,7 +8,7 @@ import math
 import anyio
 import pytest
 from flight_harness import Flight, in_the_air, now, open_flight
-from gimbal_stage import CONFIGURE, MOUNT, PITCHYAW, REQUEST, copter_with_mount, mounted, with_gimbals
+from gimbal_stage import CONFIGURE, MOUNT, PITCHYAW, REQUEST, copter_with_mount, mounted, own_ids, with_gimbals
 
 from aerokit import Position
 from aerokit import messages as m
@@ -27,6 +27,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.mavlink.enums import MavCmd, MavMountMode, MavResult
 from aerokit.sim import SimulatedCopter, SimulatedGimbal
+from aerokit.sim.faults import CommandFault
 from aerokit.vehicle.gimbal.discovery import MAX_GIMBALS
 
 pytestmark = pytest.mark.anyio
@@ -150,6 +151,28 @@ async def test_newer_order_ends_earlier_wait() -> None:
             ends.append("second")
         assert ends == ["first", "second"]
         assert degrees(gimbal)[1] == pytest.approx(-20, abs=3)
+
+
+async def test_denial_after_stale_acceptance_ends_wait() -> None:
+    """The late acceptance of an earlier order arrives before the refusal of this one."""
+    async with mounted() as flight:
+        flight.copter.faults.commands[PITCHYAW] = CommandFault(refuse_with=MavResult.DENIED, delay_s=1.0)
+        stale = m.CommandAck(PITCHYAW, MavResult.ACCEPTED, 0, 0, *own_ids(flight))
+        asyncio.get_running_loop().call_later(0.1, flight.copter.send, stale)
+        began = now()
+        with pytest.raises(CommandRejected, match=r"accepted the command and then refused it.*DENIED"):
+            await flight.vehicle.gimbal.point(-30.0, 0.0)
+        assert now() - began < 2.0
+
+
+async def test_second_copy_of_denial_does_not_end_wait() -> None:
+    """The first copy made aerokit claim control and send the order again."""
+    gimbal = SimulatedGimbal(slew_deg_s=30.0)
+    async with with_gimbals(gimbal) as flight:
+        gimbal.faults.refuse(PITCHYAW, times=1)
+        copy = m.CommandAck(PITCHYAW, MavResult.DENIED, 0, 0, *own_ids(flight))
+        asyncio.get_running_loop().call_later(1.0, gimbal.send, copy)
+        await flight.vehicle.gimbal.point(-60.0, 0.0, tolerance_deg=1.0)
 
 
 async def test_vehicle_roi_ends_gimbal_wait() -> None:

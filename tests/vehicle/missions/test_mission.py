@@ -234,8 +234,28 @@ async def test_px4_finished_mission_cannot_be_resumed() -> None:
         await mission.start()
         await mission.wait_finished(timeout=60)
         await anyio.sleep(3.0)
-        with pytest.raises(OperationTimeout, match="No valid mission available"):
+        began = now()
+        with pytest.raises(OperationRejected, match="does not fly its mission\n  - No valid mission available"):
             await mission.resume()
+        assert now() - began < 1.0
+        assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_ardupilot_finished_mission_continues_only_when_resumed() -> None:
+    """AP_Mission.cpp, set_current_cmd, stops a completed mission."""
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        end = flight.copter.motion.place
+        await mission.set_current(1)
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "AUTO"
+        assert flight.copter.motion.place == pytest.approx(end, abs=0.1)
+        await mission.resume()
+        await mission.wait_finished(timeout=60)
+        assert mission.reached == 2
 
 
 async def go_home(vehicle: Vehicle) -> None:
@@ -641,6 +661,19 @@ async def test_disarming_ends_wait_finished() -> None:
             tasks.start_soon(lambda: flight.vehicle.disarm(force=True))
             with pytest.raises(OperationRejected, match="the vehicle hit the ground at"):
                 await flight.vehicle.mission.wait_finished()
+
+
+async def test_disarming_on_a_slope_does_not_finish_mission() -> None:
+    """The vehicle stands on a hill, and the autopilot's crash check disarms it on its way to the last waypoint."""
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission, motion = flight.vehicle.mission, flight.copter.motion
+        await mission.start()
+        await reaches(flight, mission.count.value - 1)
+        motion.ground_down = motion.down
+        asyncio.get_running_loop().call_later(2.0, flight.copter.arming.disarm)
+        with pytest.raises(OperationRejected, match=r"the mission has not ended \(at item \d of"):
+            await mission.wait_finished(timeout=60)
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import Any
 
 import anyio
@@ -96,6 +97,23 @@ async def test_value_changed_by_program_is_restored() -> None:
         async with parameters.temporarily({"RTL_ALT": 2000}):
             await parameters.set("RTL_ALT", 3000)
         assert values(flight) == BEFORE
+
+
+async def test_value_written_by_other_task_during_restore_is_restored(caplog: pytest.LogCaptureFixture) -> None:
+    """The other task writes while the block reads the present value."""
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        parameters = flight.vehicle.parameters
+        on_read = flight.copter.handlers[messages.ParamRequestRead.ID]
+
+        def write_and_answer(message: messages.ParamRequestRead, channel: Any) -> None:
+            flight.copter.handlers[messages.ParamRequestRead.ID] = on_read
+            tasks.start_soon(parameters.set, "RTL_ALT", 2500)
+            on_read(message, channel)
+
+        async with parameters.temporarily({"RTL_ALT": 2000}):
+            flight.copter.handlers[messages.ParamRequestRead.ID] = write_and_answer
+        assert "another station" not in caplog.text
+        assert flight.copter.parameters["RTL_ALT"] == 1500.0
 
 
 async def test_value_of_cancelled_upload_is_restored() -> None:
@@ -199,6 +217,32 @@ async def test_nested_and_overlapping_blocks_restore_first_value() -> None:
         assert values(flight)[0] == 3000
         await second.__aexit__(None, None, None)
         assert values(flight) == BEFORE
+
+
+@pytest.mark.parametrize("begins_after_s", [0.0, 0.05, 0.15, 0.25, 0.35])
+async def test_block_that_begins_while_another_one_restores(begins_after_s: float) -> None:
+    async with open_flight(copter(), latency_s=0.1) as flight:
+        parameters = flight.vehicle.parameters
+
+        async def change(value: float) -> None:
+            async with parameters.temporarily({"RTL_ALT": value, "LAND_SPEED": 60}):
+                await anyio.sleep(1.0)
+
+        block = parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 70})
+        async with anyio.create_task_group() as tasks, block:
+            asyncio.get_running_loop().call_later(begins_after_s, tasks.start_soon, change, 3000)
+        assert values(flight) == BEFORE
+
+
+@pytest.mark.parametrize("begins_after_s", [0.0, 0.05, 0.15, 0.25, 0.35])
+async def test_write_that_begins_while_a_block_restores(begins_after_s: float) -> None:
+    async with open_flight(copter(), latency_s=0.1) as flight:
+        parameters = flight.vehicle.parameters
+        block = parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 70})
+        async with anyio.create_task_group() as tasks, block:
+            write = partial(parameters.set, "RTL_ALT", 3000)
+            asyncio.get_running_loop().call_later(begins_after_s, tasks.start_soon, write)
+        assert values(flight) in (BEFORE, (3000.0, BEFORE[1]))
 
 
 async def test_rollback_failed_names_parameters() -> None:

@@ -32,7 +32,7 @@ from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink
 from aerokit.vehicle.connect import connect
 from aerokit.vehicle.files.files import Files
-from aerokit.vehicle.parameters.access import MAX_READ_BACK, MIN_PACK_SIZE
+from aerokit.vehicle.parameters.access import MAX_READ_BACK, MIN_CHANGES_FOR_FILE
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.store import ParameterCache, default_directory
 from aerokit.vehicle.parameters.writing import ResolvedParameter, resolve_known
@@ -670,7 +670,7 @@ async def test_refused_upload_file_raises_or_falls_back(monkeypatch: pytest.Monk
 
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
-        names = list(await parameters.download())[:MIN_PACK_SIZE]
+        names = list(await parameters.download())[:MIN_CHANGES_FOR_FILE]
         monkeypatch.setattr(Files, "write", refused)
         wanted = dict.fromkeys(names, 1)
         if method == "ftp":
@@ -938,6 +938,15 @@ def test_signalling_nan_bits_are_kept() -> None:
     assert bits & 0x7F800000 == 0x7F800000
     assert bits & 0x007FFFFF
     assert not bits & 0x00400000
+
+
+def test_cache_with_default_that_is_no_number_is_ignored(tmp_path: Path) -> None:
+    cache = ParameterCache(tmp_path)
+    cache.save("vehicle", 1, ParameterTable([Parameter("A", 1.0, ParameterType.REAL32, 2.0)]))
+    path = tmp_path / "vehicle.json"
+    assert cache.load("vehicle", 1) is not None
+    path.write_text(path.read_text().replace("2.0", '"two"'))
+    assert cache.load("vehicle", 1) is None
 
 
 def test_cache_that_cannot_be_written_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -327,14 +327,15 @@ def test_stall_detector_reports_after_twelve_seconds(altitudes: dict[str, float]
     [
         (HERE.offset(north_m=0.29), False),
         (HERE.offset(north_m=0.31), True),
-        (Position(47.0, 8.0, altitude_relative_m=5.31), True),
-        (Position(47.0, 8.0, altitude_relative_m=4.69), True),
-        (Position(47.0, 8.0, altitude_relative_m=5.29), False),
+        (Position(47.0, 8.0, altitude_amsl_m=5.31), True),
+        (Position(47.0, 8.0, altitude_amsl_m=4.69), True),
+        (Position(47.0, 8.0, altitude_amsl_m=5.29), False),
+        (Position(47.0, 8.0, altitude_amsl_m=5.0, altitude_relative_m=9.0), False),
     ],
 )
 def test_stall_detector_small_movement_counts(further: Position, moves: bool) -> None:
     order_status = StallStage()
-    here = HERE if further.altitude_relative_m is None else HERE.replace(altitude_relative_m=5.0)
+    here = HERE if further.altitude_amsl_m is None else HERE.replace(altitude_amsl_m=5.0, altitude_relative_m=5.0)
     for at in range(12):
         order_status.receive(here, float(at))
     assert (order_status.receive(further, 12.0) is None) is moves

@@ -185,7 +185,7 @@ class SupervisedFlight(ABC):
         if self._is_armed_on_ground and action != "nothing":
             try:
                 await self._disarm()
-            except (CommandRejected, CommandTimeout) as error:
+            except (OperationRejected, CommandTimeout) as error:
                 # The vehicle may have taken off after it reported its landed state.
                 self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():

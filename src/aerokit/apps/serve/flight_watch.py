@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink.enums import MavLandedState, MavType
 from aerokit.vehicle.commanding.ground import IMPACT_M_S, STILL_M_S, ImpactDetector
-from aerokit.vehicle.state.telemetry import height_above_home, is_reported_on_ground
+from aerokit.vehicle.state.telemetry import altitude_amsl, height_above_home, is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,14 +69,14 @@ class FlightWatch:
         self._last_sink_m_s = 0.0
         # The last impact; None if there was none. An impact that was certainly no crash is dismissed.
         self._impact_at: float | None = None
-        self._impact_height_m: float | None = None
+        self._impact_altitude_m: float | None = None
         self._was_sudden_stop = False
         self._is_impact_dismissed = False
         # Start of the time without motion after the impact, and number of velocity reports since then.
         self._still_since = math.inf
         self._still_samples = 0
         self._moving_since = math.inf  # after a crash: when the vehicle began to move
-        self._take_off_height_m: float | None = None  # after a crash: height at which the vehicle reported a take-off
+        self._take_off_altitude_m: float | None = None  # after a crash: where a take-off was reported
         self._armed_at: float | None = None  # None if the vehicle was armed before this object was created
         self._armed_until = -math.inf  # when the vehicle was last disarmed
         self._was_in_air = False  # True if the vehicle was in the air since the last arming
@@ -157,8 +157,8 @@ class FlightWatch:
         if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
             # A crashed vehicle with running motors may report take-offs although it lies still. It counts as flying
             # once it has climbed from this height. If its height is unknown, it counts as flying at once.
-            self._take_off_height_m = height_above_home(self._vehicle.telemetry)
-            if self._take_off_height_m is None:
+            self._take_off_altitude_m = altitude_amsl(self._vehicle.telemetry)
+            if self._take_off_altitude_m is None:
                 self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
@@ -182,7 +182,7 @@ class FlightWatch:
     def _start_impact(self, at: float, down_m_s: float) -> None:
         self._forget_impact()
         self._impact_at = at
-        self._impact_height_m = height_above_home(self._vehicle.telemetry)
+        self._impact_altitude_m = altitude_amsl(self._vehicle.telemetry)
         self._was_sudden_stop = self._last_sink_m_s - down_m_s >= CRASH_STOP_M_S2 * (at - self._last_sink_at)
         armed = self._vehicle.armed.latest
         self._is_impact_dismissed = not armed and at - self._armed_until > CRASH_ARMED_WITHIN_S
@@ -220,10 +220,10 @@ class FlightWatch:
 
     @property
     def _has_climbed(self) -> bool:
-        height_m = height_above_home(self._vehicle.telemetry)
-        if height_m is None or self._take_off_height_m is None:
+        altitude_m = altitude_amsl(self._vehicle.telemetry)
+        if altitude_m is None or self._take_off_altitude_m is None:
             return False
-        return height_m - self._take_off_height_m >= CLIMBED_M
+        return altitude_m - self._take_off_altitude_m >= CLIMBED_M
 
     def _has_crashed(self, at: float) -> bool:
         if at - self._still_since < CRASH_STILL_S or self._still_samples < CRASH_STILL_SAMPLES:
@@ -235,10 +235,10 @@ class FlightWatch:
         return self._was_sudden_stop and height_m is not None and abs(height_m) < CRASH_HEIGHT_M
 
     def _is_at_impact_height(self) -> bool:
-        height_m = height_above_home(self._vehicle.telemetry)
-        if height_m is None or self._impact_height_m is None:
+        altitude_m = altitude_amsl(self._vehicle.telemetry)
+        if altitude_m is None or self._impact_altitude_m is None:
             return True
-        return abs(height_m - self._impact_height_m) <= CRASH_STILL_HEIGHT_M
+        return abs(altitude_m - self._impact_altitude_m) <= CRASH_STILL_HEIGHT_M
 
     def _dismiss_impact(self) -> None:
         self._is_impact_dismissed = True
@@ -247,12 +247,12 @@ class FlightWatch:
     def _forget_impact(self) -> None:
         self._crash = None
         self._impact_at = None
-        self._impact_height_m = None
+        self._impact_altitude_m = None
         self._is_impact_dismissed = False
         self._still_since = math.inf
         self._still_samples = 0
         self._moving_since = math.inf
-        self._take_off_height_m = None
+        self._take_off_altitude_m = None
 
     def _reset(self) -> None:
         self._forget_impact()

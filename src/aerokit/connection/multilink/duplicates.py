@@ -27,18 +27,34 @@ LATE_COPY_WINDOW_S = 10.0
 COPY_WINDOW_FRAMES = 128
 
 
-class _Seen:
-    """Record of a received frame: its links, whether its signature is valid, and whether it was delivered."""
+class ReceivedFrame:
+    """Record of a frame and its copies."""
 
-    __slots__ = ("at", "count", "is_accepted", "is_admitted", "link_bits", "proving_bits")
+    __slots__ = ("_links", "_owner_links", "at", "count", "is_admitted", "is_delivered")
 
-    def __init__(self, at: float, link_bit: int, count: int) -> None:
-        self.at = at  # receive time of the first copy
-        self.link_bits = link_bit  # has one bit for each link over which the frame arrived
-        self.proving_bits = 0  # the same, except links over which a second sender with the same ids sent the frame
-        self.count = count  # number of frames received from the sender until then, this one included
-        self.is_admitted = False  # see `Copies.was_admitted`
-        self.is_accepted = False  # see `Copies.was_accepted`
+    def __init__(self, at: float, count: int, link: int, *, is_other_peer: bool) -> None:
+        self.at = at
+        """Receive time of the first copy."""
+        self.count = count
+        """Number of frames received from the sender until then, this one included."""
+        self.is_admitted = False
+        """True if a copy has passed the signature check."""
+        self.is_delivered = False
+        # One bit for each link over which a copy arrived. `_owner_links` omits copies from a second sender with the
+        # same ids.
+        self._links = 1 << link
+        self._owner_links = 0 if is_other_peer else self._links
+
+    def add(self, link: int, *, is_other_peer: bool) -> None:
+        self._links |= 1 << link
+        if not is_other_peer:
+            self._owner_links |= 1 << link
+
+    def has_arrived_over(self, link: int) -> bool:
+        return bool(self._links & 1 << link)
+
+    def has_arrived_from_owner_over(self, link: int) -> bool:
+        return bool(self._owner_links & 1 << link)
 
 
 class Copies:
@@ -49,68 +65,42 @@ class Copies:
     """
 
     def __init__(self) -> None:
-        # (body, checksum, signature) → what is known about the frame.
-        self._seen: dict[tuple[bytes, int, bytes], _Seen] = {}
+        # The key has body, checksum and signature of the frame.
+        self._seen: dict[tuple[bytes, int, bytes], ReceivedFrame] = {}
         self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
-        self._current: _Seen | None = None  # record of the last checked frame; None before the first
-        self.is_late: bool = False
-        """True if the last checked frame may be a copy of one that was accepted over another link some seconds ago."""
+        self.current: ReceivedFrame = ReceivedFrame(-math.inf, 0, 0, is_other_peer=True)
+        """Record of the last frame that was passed to :meth:`record`."""
+        self.may_be_late_copy: bool = False
+        """True if this frame may be a copy of one that was delivered over another link some seconds ago."""
 
-    def is_copy(self, frame: Frame, link: int, *, may_prove: bool = True) -> bool:
-        """Remember a frame. Return True if an equal frame arrived recently, but only over other links.
+    def record(self, frame: Frame, link: int, *, is_other_peer: bool = False) -> bool:
+        """Record a frame. Return True if it is a copy: an equal frame arrived recently, but only over other links.
 
-        The other methods refer to the frame of the latest call. With ``may_prove=False``, the frame does not count for
-        :meth:`arrived_over`, because a second sender with the same ids sent it.
+        ``is_other_peer`` is True if a second sender with the same ids sent the frame.
         """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
         earlier = self._seen.get(key)
-        link_bit = 1 << link
-        self.is_late = False
+        self.may_be_late_copy = False
         if earlier is not None:
             age_s = frame.received_at - earlier.at
-            is_other_link = not earlier.link_bits & link_bit
+            is_other_link = not earlier.has_arrived_over(link)
             is_recent = age_s <= COPY_WINDOW_S and count - earlier.count < COPY_WINDOW_FRAMES
             if is_recent and is_other_link:
-                earlier.link_bits |= link_bit
-                earlier.proving_bits |= link_bit * may_prove
-                self._current = earlier
+                earlier.add(link, is_other_peer=is_other_peer)
+                self.current = earlier
                 return True
-            self.is_late = is_other_link and earlier.is_accepted and age_s <= LATE_COPY_WINDOW_S
+            self.may_be_late_copy = is_other_link and earlier.is_delivered and age_s <= LATE_COPY_WINDOW_S
             del self._seen[key]  # The new frame, which is not a copy, takes the place of the earlier one.
         self._counts[sender] = count + 1
-        self._current = self._seen[key] = _Seen(frame.received_at, link_bit, count + 1)
-        self._current.proving_bits = link_bit * may_prove
+        self.current = ReceivedFrame(frame.received_at, count + 1, link, is_other_peer=is_other_peer)
+        self._seen[key] = self.current
         if len(self._seen) > MAX_REMEMBERED:
             # Many frames are forgotten at once, because building the list takes time.
             for oldest_key in list(self._seen)[: MAX_REMEMBERED // 4]:
                 del self._seen[oldest_key]
         return False
-
-    @property
-    def was_accepted(self) -> bool:
-        """True if the last checked frame, or a copy of it, was accepted."""
-        return self._current is not None and self._current.is_accepted
-
-    @property
-    def was_admitted(self) -> bool:
-        """True if the last checked frame, or a copy of it, has passed the signature check."""
-        return self._current is not None and self._current.is_admitted
-
-    def arrived_over(self, link: int) -> bool:
-        """Return True if the last checked frame, or a copy of it, arrived over this link."""
-        return self._current is not None and bool(self._current.proving_bits & 1 << link)
-
-    def admit(self) -> None:
-        """Record that the last checked frame passed the signature check."""
-        if self._current is not None:
-            self._current.is_admitted = True
-
-    def accept(self) -> None:
-        """Record that the last checked frame is delivered."""
-        if self._current is not None:
-            self._current.is_accepted = True
 
 
 # For this time after a switch to another link, answers to earlier requests may arrive over the previous link.
@@ -150,7 +140,7 @@ class _Stream:
         """Return True if a frame with a newer sequence number was already accepted."""
         return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
 
-    def is_repeated(self, payload: bytes, link: int) -> bool:
+    def count_acknowledgement(self, payload: bytes, link: int) -> bool:
         """Count an acknowledgement. Return True if another link delivered it at least as often as this link."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
@@ -173,36 +163,32 @@ class MergedStreams:
     def reset(self, system_id: int) -> None:
         self._streams = {key: stream for key, stream in self._streams.items() if key & 0xFF != system_id}
 
-    def was_accepted(self, frame: Frame, link: int, *, may_prove: bool) -> bool:
-        """Return True if this frame is a copy of a frame that was accepted over another link.
-
-        ``may_prove`` is False if a second sender with the same ids sent the frame. The copy then does not prove that
-        its link leads to the vehicle.
-        """
-        if not self.copies.is_copy(frame, link, may_prove=may_prove):
+    def is_duplicate(self, frame: Frame, link: int, *, is_other_peer: bool) -> bool:
+        """Return True if this frame is a copy of a frame that was delivered over another link."""
+        if not self.copies.record(frame, link, is_other_peer=is_other_peer):
             return False
         choice = self._choices.get(frame.system_id)
         # Equal frames with a time since boot prove that their links lead to one vehicle. Other frames, such as
         # heartbeats, may be equal although they come from two vehicles. Frames that the signature check refused prove
         # nothing, because any sender can send them over two links.
-        if choice is not None and boot_time_ms(frame) and self.copies.was_admitted:
+        if choice is not None and boot_time_ms(frame) and self.copies.current.is_admitted:
             self._record_copy(choice, link, frame.received_at)
-        if not self.copies.was_accepted:
+        if not self.copies.current.is_delivered:
             return False
         self._stream(frame).received_at[link] = frame.received_at
         return True
 
     def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
         """Count the copies of a frame as evidence that their links lead to one vehicle."""
-        used = choice.used
+        used, frame = choice.used, self.copies.current
         # If the link in use did not deliver the frame, the frame may come from another vehicle.
-        if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
+        if used is None or used.is_other_hardware or not frame.has_arrived_from_owner_over(used.link):
             return
         for candidate in choice.candidates.values():
             # A frame that arrives over the link in use counts for all links with an earlier copy. A later copy counts
             # for its own link and for the link in use.
             is_new = link == used.link or candidate.link in (link, used.link)
-            if is_new and self.copies.arrived_over(candidate.link):
+            if is_new and frame.has_arrived_from_owner_over(candidate.link):
                 candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
@@ -211,7 +197,7 @@ class MergedStreams:
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)
         if choice is None or choice.used is None:
-            self.copies.accept()
+            self.copies.current.is_delivered = True
             return True  # No link is chosen for a sender without heartbeats, e.g. a radio.
         candidate = choice.candidates.get(link)
         if candidate is not None and not choice.may_be_used(candidate):
@@ -219,21 +205,20 @@ class MergedStreams:
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
             return False  # This telemetry may be older than the last telemetry that the previous link delivered.
         # A late frame that equals an accepted one is probably a delayed copy.
-        if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
+        if self.copies.may_be_late_copy and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _accepts_over_unused_link(frame, candidate, choice, stream):
             return False
         is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
         if is_after_change and frame.message_id in ACKNOWLEDGEMENTS:
-            # `is_repeated` also counts the acknowledgement, so it is called for the link in use, too.
-            is_repeated = stream.is_repeated(frame.payload, link)
+            is_repeated = stream.count_acknowledgement(frame.payload, link)  # counts those of the link in use, too
             if is_repeated and link != choice.used.link:
                 return False
         # A late answer over an unused link must not lower `newest_sequence`, or older telemetry would be accepted. The
         # link in use always sets it, because a rebooted vehicle begins with any number.
         if link == choice.used.link or not stream.has_newer(frame):
             stream.newest_sequence = frame.sequence
-        self.copies.accept()
+        self.copies.current.is_delivered = True
         return True
 
     def _stream(self, frame: Frame) -> _Stream:

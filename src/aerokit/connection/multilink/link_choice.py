@@ -48,19 +48,17 @@ class Candidate:
         """Fraction of frames lost, 0 to 1, mostly of the last dozen frames. None if unknown."""
         self.round_trip_s: float | None = None
         """Smoothed round-trip time of the probes; None before the first answer."""
-        self.is_proven: bool = False
-        """True if the link is known to lead to the vehicle."""
-        self.was_proven: bool = False
-        """True if the link was proven before the vehicle rebooted, or before :attr:`is_doubted` became True."""
-        self.is_doubted: bool = False
-        """True if the link seems to lead to another vehicle with the same system id."""
+        self.is_same_vehicle: bool | None = None
+        """True if the link leads to the vehicle, False if to another one with the same system id; None if unknown."""
+        self.was_same_vehicle: bool = False
+        """True if :attr:`is_same_vehicle` was True earlier, e.g. before the vehicle rebooted."""
         self.hardware: HardwareId | None = None
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
         """True if :attr:`hardware` is another vehicle's id. A matching clock or copies then prove nothing."""
         # Numbers of requests for the hardware id, and of TIMESYNC answers since the first request.
         self._hardware_requests = self._answers_since_request = 0
-        # Numbers of consecutive matches and mismatches of the clock, and of copies since the proof was last reset.
+        # Numbers of consecutive matches and mismatches of the clock, and of copies since the last reset.
         self._clock_matches = self._clock_mismatches = self._copies = 0
         self._last_counts = (0, 0)  # numbers of frames received and lost at the last call of `record_counts`
 
@@ -82,20 +80,20 @@ class Candidate:
         before = self.round_trip_s
         self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
 
-    def record_clock(self, matches: bool, *, may_prove: bool) -> None:
+    def record_clock(self, matches: bool, *, awaits_hardware: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        With ``may_prove=False``, matches do not prove the link yet, because its hardware id is still awaited.
+        With ``awaits_hardware``, matches prove nothing yet, because the link's hardware id is still awaited.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
         else:
             self._clock_matches, self._clock_mismatches = 0, self._clock_mismatches + 1
         # The hardware id is stronger evidence than the clock.
-        if self._clock_matches >= MIN_CLOCK_MATCHES and may_prove and not self.is_other_hardware:
-            self.is_proven, self.is_doubted = True, False
+        if self._clock_matches >= MIN_CLOCK_MATCHES and not awaits_hardware and not self.is_other_hardware:
+            self.is_same_vehicle = True
         elif self._clock_mismatches >= MIN_CLOCK_MATCHES:
-            self._doubt()
+            self._set_other_vehicle()
 
     def record_copy(self, now: float) -> None:
         """Count a frame that arrived over this link and the link in use.
@@ -105,26 +103,25 @@ class Candidate:
         self.shared_at = now
         self._copies += 1
         if self._copies >= MIN_COPIES and not self.is_other_hardware:
-            self.is_proven, self.is_doubted = True, False
+            self.is_same_vehicle = True
 
-    def reset_proof(self) -> None:
-        """Discard the proof and its evidence after the vehicle rebooted."""
-        self.was_proven = self.was_proven or self.is_proven
-        self.is_proven = self.is_other_hardware = False
+    def on_reboot(self) -> None:
+        """Discard the evidence that the link leads to the vehicle."""
+        if self.is_same_vehicle:
+            self.is_same_vehicle, self.was_same_vehicle = None, True
+        self.is_other_hardware = False
         self.hardware = None
         self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
 
-    def should_request_hardware(self) -> bool:
-        """Return True if the hardware id is to be requested over this link, and count the request."""
-        if (
-            self.hardware is not None
-            or self.answered_at == -math.inf
-            or self._hardware_requests >= MAX_HARDWARE_REQUESTS
-        ):
-            return False
+    @property
+    def needs_hardware(self) -> bool:
+        """True if the hardware id is unknown, and further requests over this link may be answered."""
+        is_answering = self.answered_at > -math.inf
+        return self.hardware is None and is_answering and self._hardware_requests < MAX_HARDWARE_REQUESTS
+
+    def count_hardware_request(self) -> None:
         self._hardware_requests += 1
-        return True
 
     @property
     def is_hardware_pending(self) -> bool:
@@ -134,10 +131,10 @@ class Candidate:
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the link's hardware id contradicts that of the vehicle."""
         if is_other:
-            self._doubt()
-            self.was_proven = False  # The link now leads to another vehicle, so an earlier proof is void.
+            self._set_other_vehicle()
+            self.was_same_vehicle = False
         elif self.is_other_hardware:  # Until now the link led to another vehicle.
-            self.is_doubted = False
+            self.is_same_vehicle = None
         self.is_other_hardware = is_other
 
     def count_answer(self) -> None:
@@ -148,9 +145,9 @@ class Candidate:
     def reset_mismatches(self) -> None:
         self._clock_mismatches = 0
 
-    def _doubt(self) -> None:
-        self.was_proven = self.was_proven or self.is_proven
-        self.is_proven, self.is_doubted = False, True
+    def _set_other_vehicle(self) -> None:
+        self.was_same_vehicle = self.was_same_vehicle or self.is_same_vehicle is True
+        self.is_same_vehicle = False
 
     def is_alive(self, now: float) -> bool:
         is_answering = now - self.answered_at <= 2 * UNPROBED_TIMEOUT_S
@@ -192,21 +189,20 @@ MAX_SWITCH_DELAY_S = 10.0
 class LinkChoice:
     """The links to one system, and the link in use.
 
-    Systems with an autopilot need proof (``needs_proof``) that a second link leads to the same vehicle: a matching
-    clock, or the same frames. Until then, frames of the second link are refused, and no command is sent over it. A link
-    with a different hardware id is refused even if the clock matches.
+    If the system has an autopilot, a second link is used only after a matching clock or equal frames have proved that
+    it leads to the same vehicle. Until then, frames of the second link are refused, and no command is sent over it. A
+    link with a different hardware id is refused even if the clock matches.
     """
 
-    def __init__(self, *, needs_proof: bool) -> None:
-        self.needs_proof: bool = needs_proof
-        """True if an autopilot was received, so that a second link must be proven before it is used."""
+    def __init__(self, *, has_autopilot: bool) -> None:
+        self.has_autopilot: bool = has_autopilot
         self.candidates: dict[int, Candidate] = {}  # by index of the link
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, received over the link that was in use then."""
-        # Index of the link that delivered `hardware`, or over which a later reboot was detected; -1 if there is none.
+        # Index of the link that delivered `hardware`, or over which a later reboot was detected; None if there is none.
         # The next id over this link replaces `hardware` even if it differs.
-        self._hardware_link = -1
+        self._hardware_link: int | None = None
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
         self.previous: Candidate | None = None
@@ -225,9 +221,9 @@ class LinkChoice:
         candidate.received_at = now
         return candidate
 
-    def start_with(self, candidate: Candidate) -> None:
+    def record_autopilot(self, candidate: Candidate) -> None:
         """Record that the autopilot's first heartbeat arrived over this link."""
-        self.needs_proof = True
+        self.has_autopilot = True
         if candidate is not self.used:
             self.used = None  # The link used so far leads to another component only, e.g. a camera.
             self.candidates = {candidate.link: candidate}  # `choose` then selects this link.
@@ -240,26 +236,28 @@ class LinkChoice:
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
-            if not self.clock.add(at, vehicle_s, round_trip_s):
-                # The clock jumped, so the vehicle has rebooted or was replaced by another vehicle. The next hardware id
-                # over this link is therefore accepted as the vehicle's id.
-                self._hardware_link = link
-                for affected in self.candidates.values():
-                    affected.reset_proof()
-            elif not self.clock.is_steady:
-                # The clock was paused for a moment, so earlier mismatches of other links prove nothing.
-                for affected in self.candidates.values():
-                    affected.reset_mismatches()
-        else:
-            candidate.count_answer()
-            matches = self.clock.matches(at, vehicle_s, round_trip_s)
-            if not matches and is_used_silent:
-                # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove
-                # another vehicle. Only a matching hardware id counts as a match; otherwise the answer is ignored
-                # (None).
-                matches = True if self._is_same_by_hardware(candidate, now) else None
-            if matches is not None:
-                candidate.record_clock(matches, may_prove=not self._awaits_hardware(candidate))
+            self._update_clock(link, at, vehicle_s, round_trip_s)
+            return
+        candidate.count_answer()
+        matches = self.clock.matches(at, vehicle_s, round_trip_s)
+        if not matches and is_used_silent:
+            # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove that
+            # this is another vehicle. Only a matching hardware id counts; otherwise the answer is ignored (None).
+            matches = True if self._is_confirmed_by_hardware(candidate, now) else None
+        if matches is not None:
+            candidate.record_clock(matches, awaits_hardware=self._awaits_hardware(candidate))
+
+    def _update_clock(self, link: int, at: float, vehicle_s: float, round_trip_s: float) -> None:
+        if not self.clock.add(at, vehicle_s, round_trip_s):
+            # The clock jumped, so the vehicle has rebooted or was replaced by another vehicle. The next hardware id
+            # over this link is therefore accepted as the vehicle's id.
+            self._hardware_link = link
+            for candidate in self.candidates.values():
+                candidate.on_reboot()
+        elif not self.clock.is_steady:
+            # The clock was paused for a moment, so earlier mismatches of other links prove nothing.
+            for candidate in self.candidates.values():
+                candidate.reset_mismatches()
 
     def record_hardware(self, link: int, hardware: HardwareId) -> None:
         candidate = self.candidates[link]
@@ -274,7 +272,7 @@ class LinkChoice:
     def may_be_used(self, candidate: Candidate) -> bool:
         if candidate.is_other_hardware:
             return False
-        return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof
+        return self.used in (None, candidate) or candidate.is_same_vehicle is True or not self.has_autopilot
 
     def is_shared(self, candidate: Candidate, now: float) -> bool:
         """Return True if the link carries the same frames as the link in use."""
@@ -306,19 +304,18 @@ class LinkChoice:
         self._command_at = now
 
     def should_request_hardware(self, candidate: Candidate, *, is_attached: bool) -> bool:
-        """Return True if the hardware id is to be requested over this link, and count the request."""
         if candidate is not self.used:
-            return not candidate.is_proven and candidate.should_request_hardware()
+            return candidate.needs_hardware and not candidate.is_same_vehicle
         # Over the link in use, an attached vehicle object requests the id itself.
         has_other_links = len(self.candidates) > 1  # With a single link, there is no other id to compare with.
-        return has_other_links and not is_attached and candidate.should_request_hardware()
+        return candidate.needs_hardware and has_other_links and not is_attached
 
-    def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
+    def _is_confirmed_by_hardware(self, candidate: Candidate, now: float) -> bool:
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
         alive = [link for link in self.candidates.values() if link.is_alive(now)]
-        return candidate.was_proven and is_same and alive == [candidate]
+        return candidate.was_same_vehicle and is_same and alive == [candidate]
 
     def _awaits_hardware(self, candidate: Candidate) -> bool:
         can_compare_ids = self.hardware is not None and candidate.hardware is not None
@@ -346,9 +343,9 @@ class LinkChoice:
             # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
             self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
-            # The chosen link was proven by comparison with the previous one (see `may_be_used`). Both therefore lead
-            # to the same vehicle, unless their hardware ids differ.
-            previous.is_proven = not previous.is_other_hardware
+            # The chosen link was compared with the previous one (see `may_be_used`). Both therefore lead to the same
+            # vehicle, unless their hardware ids differ.
+            previous.is_same_vehicle = not previous.is_other_hardware
         self.previous = previous
         self.used = chosen
         self.changed_at = now

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.multilink.vehicle_clock import HardwareId
 from aerokit.events import DuplicateSender
@@ -37,6 +37,12 @@ UNATTACHED_RATE_HZ = 40.0
 _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 
 
+class _Probe(NamedTuple):
+    system_id: int
+    link: int
+    sent_at: float
+
+
 class LinkProbes:
     """Probes each link to a system twice a second, or every five seconds if the link is costly and not in use.
 
@@ -52,10 +58,10 @@ class LinkProbes:
         send: Callable[[Message, Peer], object],
     ) -> None:
         self._names, self._choices, self._bus, self._send = names, choices, bus, send
-        self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 of a probe → system id, link, send time
+        self._pending: dict[int, _Probe] = {}  # the keys are the values of ts1
         self._probed_at: dict[tuple[int, int], float] = {}  # (system id, link) → time of its last probe
-        # Number of probes that may be sent now to systems without a vehicle object, and the time of its last refill.
-        self._budget, self._budget_at = UNATTACHED_RATE_HZ, 0.0
+        # Token bucket that limits the probes to systems without a vehicle object.
+        self._tokens, self._refilled_at = UNATTACHED_RATE_HZ, 0.0
         self._reported: set[tuple[int, int]] = set()  # (system id, link) of the reported second vehicles
         bus.require_frames(m.Timesync, m.AutopilotVersion)
 
@@ -75,12 +81,12 @@ class LinkProbes:
         """
         # An unused costly link is probed rarely once it is known whether the link leads to the vehicle.
         is_idle = candidate.is_costly and candidate is not choice.used
-        is_new = not candidate.is_proven and not candidate.is_doubted
-        interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and not is_new else PROBE_INTERVAL_S
+        is_known = candidate.is_same_vehicle is not None
+        interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and is_known else PROBE_INTERVAL_S
         key = system_id, candidate.link
         if now - self._probed_at.get(key, -math.inf) < interval_s - TIMER_TOLERANCE_S:
             return
-        if not is_attached and not self._consume_budget(now):
+        if not is_attached and not self._take_token(now):
             return
         self._probed_at[key] = now
         # The answer repeats `ts1`, which identifies the probe: our time in nanoseconds. The last three digits depend on
@@ -90,23 +96,14 @@ class LinkProbes:
             return  # The number is invalid, or belongs to another pending probe. The next probe is sent as usual.
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
-        self._pending[ts1] = system_id, candidate.link, now
+        self._pending[ts1] = _Probe(system_id, candidate.link, now)
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
-        # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack). The ack of this
-        # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm, because actions use
-        # other commands, and `request_message` waits for the message itself.
         if choice.should_request_hardware(candidate, is_attached=is_attached):
-            request = m.CommandLong(
-                system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
-                param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
-            )  # fmt: skip
-            self._send(request, peer)
+            candidate.count_hardware_request()
+            self._send(_hardware_request(system_id), peer)
 
-    def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes over any link.
-
-        The call records the answer if the autopilot sent it over the link of the probe.
-        """
+    def record_answer(self, frame: Frame, link: int) -> bool:
+        """Record the autopilot's answer to a probe over this link. Return True if the TIMESYNC answers any probe."""
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
         if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:
@@ -133,27 +130,26 @@ class LinkProbes:
             for candidate in choice.candidates.values():
                 self._report_other_vehicle(frame, candidate)
 
-    def _consume_budget(self, now: float) -> bool:
-        """Return True if one more system without a vehicle object may be probed now; their common rate is limited."""
-        self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
-        self._budget_at = now
-        if self._budget < 1:
+    def _take_token(self, now: float) -> bool:
+        self._tokens = min(UNATTACHED_RATE_HZ, self._tokens + UNATTACHED_RATE_HZ * (now - self._refilled_at))
+        self._refilled_at = now
+        if self._tokens < 1:
             return False
-        self._budget -= 1
+        self._tokens -= 1
         return True
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
         """Return the seconds since the probe. None if it was sent to another system or over another link."""
-        probed_system, probed_link, sent_at = self._pending[answer.ts1]
-        if (probed_system, probed_link) != (system_id, link):
+        probe = self._pending[answer.ts1]
+        if (probe.system_id, probe.link) != (system_id, link):
             return None
         del self._pending[answer.ts1]
-        return max(0.0, now - sent_at)
+        return max(0.0, now - probe.sent_at)
 
     def _report_other_vehicle(self, frame: Frame, candidate: Candidate) -> None:
         """Report once that the link seems to lead to another vehicle with the same system id."""
         key = frame.system_id, candidate.link
-        if not candidate.is_doubted:
+        if candidate.is_same_vehicle is not False:
             self._reported.discard(key)  # If the link leads to another vehicle later, that is reported again.
         elif key not in self._reported:
             self._reported.add(key)
@@ -164,3 +160,13 @@ class LinkProbes:
                 "hardware id in AUTOPILOT_VERSION" if candidate.is_other_hardware else "clock",
             )
             self._bus.publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
+
+
+def _hardware_request(system_id: int) -> m.CommandLong:
+    # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack). The ack of this request
+    # may therefore be taken for that of another REQUEST_MESSAGE. This does no harm, because actions use other commands,
+    # and `request_message` waits for the message itself.
+    return m.CommandLong(
+        system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
+        param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
+    )  # fmt: skip

@@ -153,21 +153,21 @@ class MultiLinkRoutes:
 
         Returns False if the routing table is full, or if the system id is 0.
         """
-        if not frame.system_id or not self._routes[_link_index(peer)].record_heartbeat(frame, peer, counters):
+        link = _link_index(peer)
+        if not frame.system_id or not self._routes[link].record_heartbeat(frame, peer, counters):
             return False
         heartbeat = self._bus.dialect.decode(frame)
         is_autopilot = getattr(heartbeat, "autopilot", MavAutopilot.INVALID) != MavAutopilot.INVALID
         choice = self._choices.get(frame.system_id)
         if choice is None:
-            choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
-        is_costly = _link_index(peer) in self._link.costly
-        candidate = choice.record_heartbeat(_link_index(peer), frame.received_at, is_costly=is_costly)
-        candidate.is_stalled = _link_index(peer) in self._stalled
-        is_first_autopilot = is_autopilot and not choice.needs_proof
+            choice = self._choices[frame.system_id] = LinkChoice(has_autopilot=is_autopilot)
+        candidate = choice.record_heartbeat(link, frame.received_at, is_costly=link in self._link.costly)
+        candidate.is_stalled = link in self._stalled
+        is_first_autopilot = is_autopilot and not choice.has_autopilot
         if is_first_autopilot:  # The links known so far lead to other components of this system.
-            choice.start_with(candidate)
+            choice.record_autopilot(candidate)
         if counters is not None:
-            self._counters.setdefault((frame.system_id, _link_index(peer)), {})[frame.component_id] = counters
+            self._counters.setdefault((frame.system_id, link), {})[frame.component_id] = counters
         if choice.used is None:
             self._choose(frame.system_id, choice, frame.received_at)
         return True
@@ -181,8 +181,8 @@ class MultiLinkRoutes:
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
         return self._routes[_link_index(peer)].arrived_on_other_peer(frame, peer)
 
-    def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        return self._routes[_link_index(peer)].claims_route(frame, peer, counters, is_signed)
+    def try_move_route(self, frame: Frame, peer: Peer, *, is_signed: bool) -> bool:
+        return self._routes[_link_index(peer)].try_move_route(frame, peer, is_signed=is_signed)
 
     def record_duplicate_sender(self, frame: Frame) -> None:
         self._routes[0].record_duplicate_sender(frame)
@@ -217,8 +217,8 @@ class MultiLinkRoutes:
 
     # -------------------------------------------------------------------- received frames
 
-    def is_copy(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
-        """Return True if this frame was already accepted over another link, or has our own ids.
+    def is_duplicate(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
+        """Return True if this frame was already delivered over another link, or has our own ids.
 
         ``is_other_peer`` is the result of `arrived_on_other_peer`.
         """
@@ -227,7 +227,7 @@ class MultiLinkRoutes:
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link_index(peer)
-        if not self._merged.was_accepted(frame, link, may_prove=not is_other_peer):
+        if not self._merged.is_duplicate(frame, link, is_other_peer=is_other_peer):
             return False
         if is_other_peer:  # A second sender proves nothing, because commands over this link go to the first sender.
             return True
@@ -241,7 +241,7 @@ class MultiLinkRoutes:
     def accepts(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
         """Return True if the frame is to be delivered. Heartbeats are recorded in any case."""
         link = _link_index(peer)
-        if frame.message_id == m.Timesync.ID and self._probes.is_answer(frame, link):
+        if frame.message_id == m.Timesync.ID and self._probes.record_answer(frame, link):
             return False
         self._probes.record_hardware(frame, link)
         if frame.message_id == m.Heartbeat.ID:
@@ -345,35 +345,22 @@ class MultiLinkRoutes:
         used = choice.used
         if reason is None or used is None:
             return
+        link, previous_link = self._link.names[used.link], None
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
             # The link cannot tell for which system the data is, so data for other systems is discarded, too. Commands
             # and transfers send it again.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
-            name = self._link.names[used.link]
-            previous = self._link.names[before.link]
+            previous_link = self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
-            log(
-                "system %d: switched to %s, because %s is %s",
-                system_id,
-                name,
-                previous,
-                _DISADVANTAGE_OF_PREVIOUS.get(reason, reason),
-            )
-        self._bus.publish(
-            LinkSelected(
-                now,
-                system_id,
-                link=self._link.names[used.link],
-                before=None if before is None else self._link.names[before.link],
-                reason=reason,
-            )
-        )
+            disadvantage = _DISADVANTAGE_OF_PREVIOUS.get(reason, reason)
+            log("system %d: switched to %s, because %s is %s", system_id, link, previous_link, disadvantage)
+        self._bus.publish(LinkSelected(now, system_id, link=link, before=previous_link, reason=reason))
         self._states.set_cell(now)
 
     def _probe(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
-        if choice.needs_proof and candidate.is_available and not candidate.is_stalled:
+        if choice.has_autopilot and candidate.is_available and not candidate.is_stalled:
             is_attached = system_id in self._attached
             for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):
                 self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)

@@ -14,6 +14,7 @@ from aerokit.protocols.servers.commands import ReceivedCommand, to_int
 
 if TYPE_CHECKING:
     from aerokit.protocols.servers.commands import CommandHandler
+    from aerokit.protocols.servers.host import ComponentIds
     from aerokit.protocols.servers.intervals import MessageStreams
 
 _CAN_ALWAYS_CAPTURE = CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE
@@ -65,7 +66,7 @@ class _Pictures:
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
-        self._last_single: tuple[tuple[int, int], int] | None = None  # sender and sequence number of a single image
+        self._last_single: tuple[ComponentIds, int] | None = None  # sender and sequence number of a single image
 
     async def start(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures

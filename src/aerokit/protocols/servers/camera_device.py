@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, CameraTrackingMode, MavResult
@@ -22,9 +21,6 @@ _UNLIMITED = -1
 
 MIN_STATUS_INTERVAL_S = 0.02
 """Minimum seconds between two CAMERA_CAPTURE_STATUS messages, even if a client requests a higher rate."""
-
-# Function that creates a CAMERA_IMAGE_CAPTURED. Its keyword arguments are image_index, capture_result and file_url.
-Shot = Callable[..., CameraImageCaptured]
 
 UNKNOWN_ATTITUDE = (math.nan, math.nan, math.nan, math.nan)
 """Quaternion of CAMERA_IMAGE_CAPTURED for an unknown attitude."""
@@ -95,15 +91,17 @@ class CameraDevice:
         """Component id of the gimbal that carries the camera; 0 if there is none."""
         return 0
 
-    def expose(self, done: Callable[[Shot | None], None]) -> None:
-        """Take an image, then call ``done`` with the image, or with None after a failure."""
+    def expose(self, done: Callable[[CameraImageCaptured | None], None]) -> None:
+        """Take an image, then call ``done`` with the image, or with None after a failure.
+
+        The caller sets the image's index, result and URL.
+        """
         raise NotImplementedError
 
-    def failed_shot(self) -> Shot:
-        """Return the `Shot` of an image that could not be taken."""
-        return partial(
-            CameraImageCaptured, time_boot_ms=self.host.time_boot_ms, time_utc=0, camera_id=0, lat=0, lon=0, alt=0,
-            relative_alt=0, q=UNKNOWN_ATTITUDE, file_url="",
+    def failed_image(self) -> CameraImageCaptured:
+        return CameraImageCaptured(
+            time_boot_ms=self.host.time_boot_ms, time_utc=0, camera_id=0, lat=0, lon=0, alt=0, relative_alt=0,
+            q=UNKNOWN_ATTITUDE, image_index=0, capture_result=0, file_url="",
         )  # fmt: skip
 
     def has_space(self) -> bool:
@@ -174,14 +172,14 @@ class Captures:
         self._is_exposing = False  # True while an image is being taken
         self._is_late = False  # True if the next image is due, but the previous one is not finished
         self._series = 0  # number of the series; callbacks of earlier series are ignored
-        self._recording_since = math.nan  # start of the video; NaN while there is no video
+        self._recording_since: float | None = None  # start of the video; None while there is no video
 
     def switch_off(self) -> None:
         """End the series and the video at once, as a power failure does. The image log is kept."""
         self._remaining = 0
         self._is_exposing = False
         self._is_late = False
-        self._recording_since = math.nan
+        self._recording_since = None
         self._series += 1
 
     @property
@@ -190,7 +188,7 @@ class Captures:
 
     @property
     def is_recording(self) -> bool:
-        return not math.isnan(self._recording_since)
+        return self._recording_since is not None
 
     def take(self) -> None:
         self.take_series(interval_s=0.0, count=1)
@@ -234,24 +232,24 @@ class Captures:
         if self._remaining != _UNLIMITED:
             self._remaining -= 1
         self._is_exposing = True
-        camera.expose(lambda shot: self._finish(series, shot))
+        camera.expose(lambda image: self._finish(series, image))
         if self._remaining:
             wait_s = max(self.interval_s, camera.shutter_s)
             camera.host.call_later(wait_s, lambda: self._begin_image(series))
 
-    def _finish(self, series: int, shot: Shot | None) -> None:
+    def _finish(self, series: int, taken: CameraImageCaptured | None) -> None:
         """Log and announce an image. None means that the device failed to take it."""
         if series != self._series:
             return
         self._is_exposing = False
         camera, index = self._camera, self.image_count
-        url = None if shot is None else camera.store_image(shot(image_index=index, capture_result=1))
-        make_image = camera.failed_shot() if shot is None else shot
+        image = _changed(taken or camera.failed_image(), image_index=index, capture_result=1)
+        url = None if taken is None else camera.store_image(image)
         if url is None:
             self.stop()
-            image = make_image(image_index=index, capture_result=0)
+            image = _changed(image, capture_result=0)
         else:
-            image = make_image(image_index=index, capture_result=1, file_url=url)
+            image = _changed(image, file_url=url)
             self.images.append(image)
             if len(self.images) > camera.max_images:
                 del self.images[0]
@@ -275,11 +273,13 @@ class Captures:
 
         The length is 0 if no video was being recorded.
         """
-        if not self.is_recording:
-            return 0.0
-        seconds = self._camera.host.now - self._recording_since
-        self._recording_since = math.nan
+        seconds = self._recording_s
+        self._recording_since = None
         return seconds
+
+    @property
+    def _recording_s(self) -> float:
+        return 0.0 if self._recording_since is None else self._camera.host.now - self._recording_since
 
     def _send_status_every(self, recording: float, interval_s: float) -> None:
         def send_status() -> None:
@@ -296,12 +296,15 @@ class Captures:
             image_status = _WAITING_AND_CAPTURING if self._is_exposing else _WAITING
         else:
             image_status = _CAPTURING if self._is_exposing else _IDLE
-        recording_s = camera.host.now - self._recording_since if self.is_recording else 0.0
         return CameraCaptureStatus(
             time_boot_ms=camera.host.time_boot_ms, image_status=image_status, video_status=int(self.is_recording),
-            image_interval=self.interval_s if is_series else 0.0, recording_time_ms=round(recording_s * 1000),
+            image_interval=self.interval_s if is_series else 0.0, recording_time_ms=round(self._recording_s * 1000),
             available_capacity=camera.free_mib, image_count=self.image_count,
         )  # fmt: skip
+
+
+def _changed(image: CameraImageCaptured, **fields: Any) -> CameraImageCaptured:
+    return CameraImageCaptured(**{**image.to_dict(), **fields})
 
 
 _UNKNOWN = math.nan

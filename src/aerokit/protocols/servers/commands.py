@@ -7,9 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandCancel, CommandInt, CommandLong
-from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class ReceivedCommand:
     frame: int | None
     """MAV_FRAME of a COMMAND_INT; None for COMMAND_LONG."""
     channel: Channel
-    sender: tuple[int, int]
+    sender: ComponentIds
     confirmation: int = 0
     """Number of earlier transmissions of this COMMAND_LONG."""
 
@@ -144,10 +145,9 @@ class CommandDispatcher:
 
     def answer(self, command: ReceivedCommand, result: int, progress: int = 0, detail: int = 0) -> None:
         """Send an acknowledgement with ``detail`` as its ``result_param2``."""
-        system, component = command.sender
         ack = CommandAck(
-            command.command, result, progress=progress, result_param2=detail, target_system=system,
-            target_component=component,
+            command.command, result, progress=progress, result_param2=detail, target_system=command.sender.system,
+            target_component=command.sender.component,
         )  # fmt: skip
         self._host.send(ack, command.channel)
 
@@ -166,12 +166,21 @@ MAX_RESULTS = 256
 """Maximum number of stored results. If there are more, the oldest is forgotten."""
 
 
-class Outcome(NamedTuple):
-    """Result of a command: fields of COMMAND_ACK."""
+class CommandResult(Snapshot):
+    """Result of a command handler: a MAV_RESULT, and two numbers whose meaning depends on the command."""
 
-    result: int
+    result: int = MavResult.ACCEPTED.value
     progress: int = 0
     detail: int = 0
+    """``result_param2`` of COMMAND_ACK."""
+
+
+class EndedCommand(NamedTuple):
+    """A command that has ended, and the time of its end."""
+
+    command: ReceivedCommand
+    result: CommandResult
+    ended_at: float
 
 
 class RunningCommand:
@@ -198,9 +207,8 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # Maps (MAV_CMD, sender) to the last command that has ended, its result, and the time of its end. The command
-        # that ended last is the last entry.
-        self._ended: dict[tuple[int, tuple[int, int]], tuple[ReceivedCommand, Outcome, float]] = {}
+        # The last command that has ended, by MAV_CMD and sender. The command that ended last is the last entry.
+        self._ended: dict[tuple[int, ComponentIds], EndedCommand] = {}
         host.on(CommandCancel, self._on_cancel)
 
     def __len__(self) -> int:
@@ -219,13 +227,12 @@ class RunningCommands:
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
         ended = self._ended.get((command.command, command.sender))
+        has_result = ended is not None and self._host.now - ended.ended_at <= RESULT_MAX_AGE_S
         # A stop command is executed again, because it may be a new one whose first transmission was lost.
-        if ended is not None and not is_stop:
-            ended_command, outcome, ended_at = ended
-            if _is_repeated(command, ended_command) and self._host.now - ended_at <= RESULT_MAX_AGE_S:
-                self._server.answer(command, *outcome)
-                return None
-        if running is not None and is_stop and self._end_for(running, command):
+        if ended is not None and has_result and not is_stop and _is_repeated(command, ended.command):
+            self._server.answer(command, **ended.result.to_dict())
+            return None
+        if running is not None and is_stop and self._cancel_for(running, command):
             running = None
         if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
             self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
@@ -235,7 +242,7 @@ class RunningCommands:
         self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(started))
         return started
 
-    def _end_for(self, running: RunningCommand, command: ReceivedCommand) -> bool:
+    def _cancel_for(self, running: RunningCommand, command: ReceivedCommand) -> bool:
         """Cancel a running command, because ``command`` stops it. Return False if it cannot be cancelled."""
         del self._running[command.command]
         if not running.cancel():
@@ -256,20 +263,20 @@ class RunningCommands:
             self._server.answer(running.command, MavResult.IN_PROGRESS, running.progress)
             self._host.call_later(PROGRESS_INTERVAL_S, lambda: self._report_repeatedly(running))
 
-    def finish(self, running: RunningCommand, outcome: Outcome) -> None:
+    def finish(self, running: RunningCommand, result: CommandResult) -> None:
         command = running.command
         if self._running.get(command.command) is running:
             del self._running[command.command]
-            self._record_result(command, outcome)
-            self._server.answer(command, *outcome)
+            self._record_result(command, result)
+            self._server.answer(command, **result.to_dict())
 
-    def _record_result(self, command: ReceivedCommand, outcome: Outcome) -> None:
+    def _record_result(self, command: ReceivedCommand, result: CommandResult) -> None:
         # Each sender has its own entry, because a repetition may arrive after the same command of another sender.
         key = (command.command, command.sender)
         self._ended.pop(key, None)  # The new entry must be the last one.
         if len(self._ended) >= MAX_RESULTS:
             del self._ended[next(iter(self._ended))]
-        self._ended[key] = (command, outcome, self._host.now)
+        self._ended[key] = EndedCommand(command, result, self._host.now)
 
     def cancel_all(self) -> None:
         for running in tuple(self._running.values()):

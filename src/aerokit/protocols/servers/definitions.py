@@ -8,8 +8,8 @@ from __future__ import annotations
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import ParamAck
 from aerokit.parameters import CameraDefinition, SettingValue
-from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
-from aerokit.protocols.servers.host import ServerHost
+from aerokit.parameters.parameter import setting_value, settings_equal
+from aerokit.protocols.servers.host import Channel, ServerHost
 from aerokit.protocols.servers.parameters import ExtendedParameterServer
 
 _ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "string": "", "custom": ""}
@@ -58,24 +58,27 @@ class DefinedParameterServer(ExtendedParameterServer):
         super().restart()
         self._pending.clear()
 
-    def value(self, name: str) -> tuple[SettingValue, int]:
+    def send(self, name: str, index: int, channel: Channel) -> None:
         self.refresh()
+        super().send(name, index, channel)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.values
+
+    def value(self, name: str) -> tuple[SettingValue, int]:
         return self.values[name], self.definition.settings[name].wire_type
 
-    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        """Set a value, or begin to set it if it is in `slow`. Return PARAM_ACK, and the value and type to report."""
-        setting = self.definition.settings.get(name)
-        if setting is None:
-            return ParamAck.VALUE_UNSUPPORTED, data, kind
+    def set(self, name: str, data: bytes, kind: int) -> int:
+        """Set a value, or begin to set it if it is in `slow`. Return the PARAM_ACK."""
         result, value = self._check(name, setting_value(data, kind), kind)
         if result == ParamAck.ACCEPTED and name in self.slow and name not in self._pending:
             self._pending.add(name)
             self._host.call_later(self.slow[name], lambda: self._finish_slow(name, value))
         if name in self._pending:
-            result = ParamAck.IN_PROGRESS
-        elif result == ParamAck.ACCEPTED:
+            return ParamAck.IN_PROGRESS
+        if result == ParamAck.ACCEPTED:
             self._store(name, value)
-        return result, setting_bytes(self.values[name], setting.wire_type), setting.wire_type
+        return result
 
     def _check(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
         """Return PARAM_ACK for the answer, and the value to store."""
@@ -100,5 +103,4 @@ class DefinedParameterServer(ExtendedParameterServer):
     def _finish_slow(self, name: str, value: SettingValue) -> None:
         self._pending.discard(name)
         self._store(name, value)
-        kind = self.definition.settings[name].wire_type
-        self.acknowledge(name, setting_bytes(self.values[name], kind), kind, ParamAck.ACCEPTED)
+        self.acknowledge(name, ParamAck.ACCEPTED)

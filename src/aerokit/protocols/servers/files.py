@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from typing_extensions import Self
 
@@ -12,8 +12,12 @@ from typing_extensions import Self
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
 
-# An entry has a name, and a size in bytes, which is None for a folder.
-Entry = tuple[str, int | None]
+
+class Entry(NamedTuple):
+    """An entry of a folder. The size is in bytes, and None for a folder."""
+
+    name: str
+    size: int | None
 
 
 class FileFault(Exception):
@@ -122,7 +126,7 @@ class TextMount(Mount):
         return _Opened(None, _File(self._texts[path].encode()))
 
     def entries(self) -> list[Entry]:
-        return [(name, self._REPORTED_SIZE) for name in self._texts]
+        return [Entry(name, self._REPORTED_SIZE) for name in self._texts]
 
 
 class _File:
@@ -306,7 +310,7 @@ class FileTree:
         folder = self._find(path)
         if not isinstance(folder, dict):
             raise FileFault(ENOTDIR)
-        return [(name, None if isinstance(node, dict) else node.size) for name, node in folder.items()]
+        return [Entry(name, None if isinstance(node, dict) else node.size) for name, node in folder.items()]
 
     def make_folder(self, path: str) -> None:
         folder, name = self._parent(path)

@@ -34,14 +34,14 @@ class FtpSession:
     size: int
     is_writing: bool
     next_block: FtpPacket | None = field(default=None, repr=False)
-    """Sequence number and offset of the next block of the running burst; None if none runs."""
+    """Request for the next block of the running burst; None if none runs."""
     burst_sent: int = 0
     """Number of bytes that the current burst has sent."""
 
 
 @dataclass(eq=False)
-class FtpPeer:
-    """State for one client."""
+class ServedClient:
+    """A client: its open files and its latest request."""
 
     channel: Channel
     sessions: dict[int, FtpSession] = field(default_factory=dict)
@@ -55,6 +55,10 @@ class FtpPeer:
     """CalcFileCRC32 request that is being executed."""
     checksum_file: FileHandle | None = None
     """File of the latest CalcFileCRC32 request; closed when the checksum is complete."""
+
+    @property
+    def is_idle(self) -> bool:
+        return not self.sessions and self.checksum_request is None
 
 
 class SessionFtpServer(Generic[FilesT]):
@@ -98,25 +102,25 @@ class SessionFtpServer(Generic[FilesT]):
         self.burst_interval_s = burst_interval_s
         self._is_enabled = is_enabled
         self._is_congested = is_congested
-        self._peers: dict[Hashable, FtpPeer] = {}
+        self._clients: dict[Hashable, ServedClient] = {}
         host.on(FileTransferProtocol, self._on_message)
 
     @property
     def open_sessions(self) -> int:
-        return sum(len(peer.sessions) for peer in self._peers.values())
+        return sum(len(client.sessions) for client in self._clients.values())
 
     def restart(self) -> None:
         """Drop all sessions without closing their files, as a power failure does."""
-        self._peers.clear()
+        self._clients.clear()
 
     def close(self) -> None:
-        for peer in self._peers.values():
+        for client in self._clients.values():
             with suppress(FileFault):
-                self._close_all(peer)
-            if peer.checksum_file is not None:  # The file is still open if the checksum is not complete.
+                self._close_all(client)
+            if client.checksum_file is not None:  # The file is still open if the checksum is not complete.
                 with suppress(FileFault):
-                    peer.checksum_file.close()
-        self._peers.clear()
+                    client.checksum_file.close()
+        self._clients.clear()
 
     def _on_message(self, message: FileTransferProtocol, channel: Channel) -> None:
         if self._is_enabled():
@@ -126,79 +130,78 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the key under which the state of this client is stored."""
         return request.client
 
-    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, reply: FtpPacket) -> bool:
+    def _is_repeated(self, client: ServedClient, request: FtpPacket, reply: FtpPacket) -> bool:
         """Return True if the request repeats the client's latest request, and ``reply`` answers that request."""
         # Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0.
-        is_same = peer.request is not None and request.repeats(peer.request)
+        is_same = client.request is not None and request.repeats(client.request)
         # The last reply of a burst has a higher number, so a repeated burst request starts the burst again.
         reply_sequence = (request.sequence + 1) & 0xFFFF
         return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 
-    def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
+    def _new_number(self, client: ServedClient, request: FtpPacket) -> int:
         # A client may request a number, as MAVProxy does. 0 means any number.
-        if request.session and request.session not in peer.sessions:
+        if request.session and request.session not in client.sessions:
             return request.session
-        return next(number for number in range(self.max_sessions) if number not in peer.sessions)
+        return next(number for number in range(self.max_sessions) if number not in client.sessions)
 
-    def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+    def _answer_fault(self, client: ServedClient, request: FtpPacket, fault: FileFault) -> FtpPacket:
         return request.refuse_errno(fault.errno)
 
-    def _peer(self, request: FtpPacket, channel: Channel) -> FtpPeer | None:
+    def _client_of(self, request: FtpPacket, channel: Channel) -> ServedClient | None:
         """Return the state of a client, or None if too many clients have open files."""
         key = self._key(request, channel)
-        if key not in self._peers and len(self._peers) >= self.max_clients:
-            idle = (other for other, peer in self._peers.items() if not peer.sessions and peer.checksum_request is None)
-            idle_key = next(idle, None)
+        if key not in self._clients and len(self._clients) >= self.max_clients:
+            idle_key = next((other for other, client in self._clients.items() if client.is_idle), None)
             if idle_key is None:
                 return None
-            del self._peers[idle_key]  # A client without open files makes room for the new one.
-        peer = self._peers.setdefault(key, FtpPeer(channel))
-        peer.channel = channel
-        return peer
+            del self._clients[idle_key]  # A client without open files makes room for the new one.
+        client = self._clients.setdefault(key, ServedClient(channel))
+        client.channel = channel
+        return client
 
     def receive(self, request: FtpPacket, channel: Channel) -> None:
-        peer = self._peer(request, channel)
-        if peer is None:
+        client = self._client_of(request, channel)
+        if client is None:
             self._host.send(request.refuse(MavFtpErr.NOSESSIONSAVAILABLE).message(), channel)
             return
-        peer.used_at = self._host.now
+        client.used_at = self._host.now
         if request.size > DATA_SIZE:
-            self._reply(peer, request.refuse(MavFtpErr.INVALIDDATASIZE))
-        elif (reply := peer.reply) is not None and self._is_repeated(peer, request, reply):
-            self._reply(peer, reply)
+            self._reply(client, request.refuse(MavFtpErr.INVALIDDATASIZE))
+        elif (reply := client.reply) is not None and self._is_repeated(client, request, reply):
+            self._reply(client, reply)
         else:
-            self._answer(peer, request)
+            self._answer(client, request)
 
-    def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
+    def _answer(self, client: ServedClient, request: FtpPacket) -> None:
         """Execute a request, and send the answer. A handler that returns None sends the answer itself, later."""
         handler = _HANDLERS.get(request.opcode)
-        peer.request = request
-        peer.reply = None  # The reply to the previous request must not be sent again.
+        client.request = request
+        client.reply = None  # The reply to the previous request must not be sent again.
         try:
-            answer = self._unknown(request) if handler is None else handler(self, peer, request)
+            answer = self._unknown(request) if handler is None else handler(self, client, request)
         except Refused as refused:
             answer = request.refuse(refused.code)
         except FileFault as fault:
-            answer = self._answer_fault(peer, request, fault)
+            answer = self._answer_fault(client, request, fault)
         if answer is not None:
-            self._reply(peer, self._adapted(peer, request, answer))
+            self._reply(client, self._adapted(client, request, answer))
 
-    def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
+    def _adapted(self, client: ServedClient, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
         """Return the answer with its fields set as the firmware sets them."""
         return answer.replace(offset=request.offset)
 
-    def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
+    def _reply(self, client: ServedClient, answer: FtpPacket) -> None:
         # NOSESSIONSAVAILABLE is not stored: the client repeats its request until a session is free, and then needs a
         # new answer.
         if answer.size <= self.max_stored_reply_size and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
-            peer.reply = answer
-        self._host.send(answer.message(), peer.channel)
+            client.reply = answer
+        self._host.send(answer.message(), client.channel)
 
     def _path(self, request: FtpPacket) -> str:
         return checked_path(request.data[: request.size])
 
-    def _session_of(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
-        session = peer.sessions.get(request.session)
+    def _session_of(self, client: ServedClient, request: FtpPacket) -> FtpSession:
+        session = client.sessions.get(request.session)
         if session is None:
             raise Refused(MavFtpErr.INVALIDSESSION)
         return session
@@ -206,24 +209,24 @@ class SessionFtpServer(Generic[FilesT]):
     def _unknown(self, request: FtpPacket) -> FtpPacket:
         return request.refuse(MavFtpErr.UNKNOWNCOMMAND)
 
-    def _none(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _none(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         return request.acknowledge(request.data[: request.size])
 
-    def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._session_of(peer, request)
-        del peer.sessions[request.session]
+    def _terminate(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        session = self._session_of(client, request)
+        del client.sessions[request.session]
         session.next_block = None
         session.file.close()
         return request.acknowledge()
 
-    def _reset(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        self._close_all(peer)
+    def _reset(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        self._close_all(client)
         return request.acknowledge()
 
-    def _close_all(self, peer: FtpPeer) -> None:
+    def _close_all(self, client: ServedClient) -> None:
         """Close all files of a client. If an error occurs, it is raised after the last file."""
-        sessions = list(peer.sessions.values())
-        peer.sessions.clear()
+        sessions = list(client.sessions.values())
+        client.sessions.clear()
         fault = None
         for session in sessions:
             session.next_block = None
@@ -234,8 +237,8 @@ class SessionFtpServer(Generic[FilesT]):
         if fault is not None:
             raise fault
 
-    def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        if len(peer.sessions) >= self.max_sessions:
+    def _open(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        if len(client.sessions) >= self.max_sessions:
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
         path = self._path(request)
         is_reading = request.opcode == Op.OPENFILERO
@@ -245,10 +248,10 @@ class SessionFtpServer(Generic[FilesT]):
         may_create = not is_reading and self.creates_missing
         create = request.opcode == Op.CREATEFILE or (may_create and path not in self.files)
         file = self.files.open(path, writing=not is_reading, create=create)
-        number = self._new_number(peer, request)
+        number = self._new_number(client, request)
         session = FtpSession(number, file, size, is_writing=not is_reading)
-        peer.sessions[number] = session
-        self._watch(peer, session)
+        client.sessions[number] = session
+        self._watch(client, session)
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
     def _size(self, path: str, *, reading: bool) -> int:
@@ -259,82 +262,79 @@ class SessionFtpServer(Generic[FilesT]):
                 raise
             return 0
 
-    def _watch(self, peer: FtpPeer, session: FtpSession) -> None:
+    def _watch(self, client: ServedClient, session: FtpSession) -> None:
         """Schedule the time-out that closes the session."""
 
         def close_if_due() -> None:
-            if peer.sessions.get(session.number) is not session:
+            if client.sessions.get(session.number) is not session:
                 return
-            due_at = peer.used_at + self.session_timeout_s
+            due_at = client.used_at + self.session_timeout_s
             if self._host.now < due_at:  # The client has sent a request since this call was scheduled.
                 self._host.call_at(due_at, close_if_due)
                 return
-            peer.reply = None
-            del peer.sessions[session.number]
+            client.reply = None
+            del client.sessions[session.number]
             session.next_block = None
             with suppress(FileFault):
                 session.file.close()
 
-        self._host.call_at(peer.used_at + self.session_timeout_s, close_if_due)
+        self._host.call_at(client.used_at + self.session_timeout_s, close_if_due)
 
-    def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._session_of(peer, request)
+    def _read(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        session = self._session_of(client, request)
         if request.offset >= session.size:
             return request.refuse(MavFtpErr.EOF)
         return request.acknowledge(session.file.read(request.offset, request.size))
 
-    def _write(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        session = self._session_of(peer, request)
+    def _write(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        session = self._session_of(client, request)
         session.file.write(request.offset, request.data[: request.size])
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
-    def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
+    def _start_burst(self, client: ServedClient, request: FtpPacket) -> FtpPacket | None:
         """Start a burst, or move a running one to another offset."""
-        session = self._session_of(peer, request)
+        session = self._session_of(client, request)
         is_running = session.next_block is not None
-        first_sequence = (request.sequence + 1) & 0xFFFF
-        session.next_block = request.replace(sequence=first_sequence)
+        session.next_block = request
         session.burst_sent = 0
         if not is_running:
-            self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
+            self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(client, session))
         return None
 
-    def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
+    def _send_blocks(self, client: ServedClient, session: FtpSession) -> None:
         max_blocks = 0 if self._is_congested() else self.burst
         for number in range(max_blocks):
             if session.next_block is None:
                 return
-            self._send_block(peer, session, session.next_block, may_end=number == self.burst - 1)
+            self._send_block(client, session, session.next_block, may_end=number == self.burst - 1)
         if session.next_block is not None:
-            self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
+            self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(client, session))
 
-    def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
+    def _send_block(self, client: ServedClient, session: FtpSession, request: FtpPacket, *, may_end: bool) -> None:
         """Send a block of a burst, or the NAK that ends the burst.
 
         With ``may_end``, this block is the burst's last one if it has sent enough bytes.
         """
-        # Unlike in a request, the sequence number in `burst` is already that of the reply.
-        number = session.number
-        answer = burst.acknowledge(offset=burst.offset, session=number).replace(sequence=burst.sequence)
-        refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=number)
+        refusal = request.refuse(MavFtpErr.EOF)
         try:
-            data = b"" if burst.offset >= session.size else session.file.read(burst.offset, DATA_SIZE)
+            data = b"" if request.offset >= session.size else session.file.read(request.offset, DATA_SIZE)
         except FileFault as fault:
             data = b""
-            peer.errno = fault.errno
-            refusal = refusal.replace(data=bytes([MavFtpErr.FAILERRNO, peer.errno]), size=2)
+            client.errno = fault.errno
+            refusal = request.refuse(MavFtpErr.FAILERRNO, fault.errno)
         if not data:
             session.next_block = None
-            self._reply(peer, refusal)
+            self._reply(client, refusal.replace(offset=request.offset, session=session.number))
             return
         session.burst_sent += len(data)
         is_complete = may_end and session.burst_sent > _BURST_BYTES
-        self._reply(peer, answer.replace(data=data, size=len(data), burst_complete=is_complete))
-        next_sequence = (burst.sequence + 1) & 0xFFFF
-        next_block = burst.replace(sequence=next_sequence, offset=burst.offset + len(data))
+        answer = request.acknowledge(data, offset=request.offset, session=session.number)
+        self._reply(client, answer.replace(burst_complete=is_complete))
+        next_sequence = (request.sequence + 1) & 0xFFFF
+        next_block = request.replace(sequence=next_sequence, offset=request.offset + len(data))
         session.next_block = None if is_complete else next_block
 
-    def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _list(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         max_line_size = DATA_SIZE - len(self.line_end)
         lines = [*self.list_prefix, *map(_line, self._entries(self._path(request)))]
         # A line that fits into no message becomes S ("skip"). Otherwise the answer would be EOF, the end of the list.
@@ -355,30 +355,32 @@ class SessionFtpServer(Generic[FilesT]):
         change(self._path(request))
         return request.acknowledge()
 
-    def _remove(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _remove(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         is_file = request.opcode == Op.REMOVEFILE
         return self._change(request, self.files.remove_file if is_file else self.files.remove_folder)
 
-    def _truncate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _truncate(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         return self._change(request, lambda path: self.files.truncate(path, request.offset))
 
-    def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _rename(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         old_path, _, new_path = request.data[: request.size].partition(b"\0")
         if len(old_path) + 2 >= request.size:  # The data ends after the old path, so there is no new path.
-            return self._answer_fault(peer, request, FileFault(EINVAL))
+            return self._answer_fault(client, request, FileFault(EINVAL))
         self.files.rename(checked_path(old_path), checked_path(new_path))
         return request.acknowledge()
 
-    def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
+    def _crc32(self, client: ServedClient, request: FtpPacket) -> FtpPacket | None:
         path = self._path(request)
-        is_repeated = peer.checksum_request is not None and request.repeats(peer.checksum_request)
+        is_repeated = client.checksum_request is not None and request.repeats(client.checksum_request)
         if not is_repeated:  # The running computation also answers a repeated request.
             file = self.files.open(path)
-            peer.checksum_request, peer.checksum_file = request, file
-            self._continue_crc32(peer, request, file, offset=0, checksum=0)
+            client.checksum_request, client.checksum_file = request, file
+            self._continue_crc32(client, request, file, offset=0, checksum=0)
         return None
 
-    def _continue_crc32(self, peer: FtpPeer, request: FtpPacket, file: FileHandle, offset: int, checksum: int) -> None:
+    def _continue_crc32(
+        self, client: ServedClient, request: FtpPacket, file: FileHandle, offset: int, checksum: int
+    ) -> None:
         # The checksum is computed in slices, so that a large file does not block the event loop.
         has_more = True
         try:
@@ -392,38 +394,37 @@ class SessionFtpServer(Generic[FilesT]):
             answer = request.acknowledge(checksum.to_bytes(4, "little"))
         except FileFault as fault:
             has_more = False
-            answer = self._answer_fault(peer, request, fault)
-        if peer.checksum_request is request and has_more:
-            self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(peer, request, file, offset, checksum))
+            answer = self._answer_fault(client, request, fault)
+        if client.checksum_request is request and has_more:
+            self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(client, request, file, offset, checksum))
             return
         with suppress(FileFault):
             file.close()
-        if peer.checksum_request is request:  # A request that a newer one has replaced gets no answer.
-            peer.checksum_request = None
-            peer.used_at = self._host.now
-            self._reply(peer, self._adapted(peer, request, answer))
+        if client.checksum_request is request:  # A request that a newer one has replaced gets no answer.
+            client.checksum_request = None
+            client.used_at = self._host.now
+            self._reply(client, self._adapted(client, request, answer))
 
 
 def _line(entry: Entry) -> bytes:
-    name, size = entry
-    return (f"D{name}" if size is None else f"F{name}\t{size}").encode()
+    return (f"D{entry.name}" if entry.size is None else f"F{entry.name}\t{entry.size}").encode()
 
 
-_HANDLERS: dict[int, Callable[[SessionFtpServer[Any], FtpPeer, FtpPacket], FtpPacket | None]] = {
-    Op.NONE: lambda server, peer, request: server._none(peer, request),
-    Op.TERMINATESESSION: lambda server, peer, request: server._terminate(peer, request),
-    Op.RESETSESSION: lambda server, peer, request: server._reset(peer, request),
-    Op.LISTDIRECTORY: lambda server, peer, request: server._list(peer, request),
-    Op.OPENFILERO: lambda server, peer, request: server._open(peer, request),
-    Op.READFILE: lambda server, peer, request: server._read(peer, request),
-    Op.CREATEFILE: lambda server, peer, request: server._open(peer, request),
-    Op.WRITEFILE: lambda server, peer, request: server._write(peer, request),
-    Op.REMOVEFILE: lambda server, peer, request: server._remove(peer, request),
+_HANDLERS: dict[int, Callable[[SessionFtpServer[Any], ServedClient, FtpPacket], FtpPacket | None]] = {
+    Op.NONE: lambda server, client, request: server._none(client, request),
+    Op.TERMINATESESSION: lambda server, client, request: server._terminate(client, request),
+    Op.RESETSESSION: lambda server, client, request: server._reset(client, request),
+    Op.LISTDIRECTORY: lambda server, client, request: server._list(client, request),
+    Op.OPENFILERO: lambda server, client, request: server._open(client, request),
+    Op.READFILE: lambda server, client, request: server._read(client, request),
+    Op.CREATEFILE: lambda server, client, request: server._open(client, request),
+    Op.WRITEFILE: lambda server, client, request: server._write(client, request),
+    Op.REMOVEFILE: lambda server, client, request: server._remove(client, request),
     Op.CREATEDIRECTORY: lambda server, _, request: server._change(request, server.files.make_folder),
-    Op.REMOVEDIRECTORY: lambda server, peer, request: server._remove(peer, request),
-    Op.OPENFILEWO: lambda server, peer, request: server._open(peer, request),
-    Op.TRUNCATEFILE: lambda server, peer, request: server._truncate(peer, request),
-    Op.RENAME: lambda server, peer, request: server._rename(peer, request),
-    Op.CALCFILECRC: lambda server, peer, request: server._crc32(peer, request),
-    Op.BURSTREADFILE: lambda server, peer, request: server._start_burst(peer, request),
+    Op.REMOVEDIRECTORY: lambda server, client, request: server._remove(client, request),
+    Op.OPENFILEWO: lambda server, client, request: server._open(client, request),
+    Op.TRUNCATEFILE: lambda server, client, request: server._truncate(client, request),
+    Op.RENAME: lambda server, client, request: server._rename(client, request),
+    Op.CALCFILECRC: lambda server, client, request: server._crc32(client, request),
+    Op.BURSTREADFILE: lambda server, client, request: server._start_burst(client, request),
 }

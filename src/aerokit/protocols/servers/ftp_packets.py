@@ -8,7 +8,7 @@ from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp import FtpMessage
 from aerokit.protocols.servers.files import EEXIST, ENOENT
-from aerokit.protocols.servers.host import sender_of
+from aerokit.protocols.servers.host import ComponentIds, sender_of
 
 
 class FtpPacket(FtpMessage):
@@ -17,8 +17,7 @@ class FtpPacket(FtpMessage):
     In a request, ``data`` always has 239 bytes.
     """
 
-    client: tuple[int, int] = (0, 0)
-    """System and component id of the client."""
+    client: ComponentIds = ComponentIds()
 
     @classmethod
     def parse(cls, message: FileTransferProtocol) -> FtpPacket:
@@ -30,10 +29,8 @@ class FtpPacket(FtpMessage):
         return are_equal and self.data[: self.size] == other.data[: other.size]
 
     def message(self) -> FileTransferProtocol:
-        system, component = self.client
-        return FileTransferProtocol(
-            target_network=0, target_system=system, target_component=component, payload=self.encode()
-        )
+        target_network = 0
+        return FileTransferProtocol(target_network, *self.client, self.encode())
 
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
         return FtpPacket(

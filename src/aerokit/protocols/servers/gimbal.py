@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from aerokit._internal.rotations import euler_from_quaternion, quaternion_from_euler
 from aerokit.mavlink import messages as m
@@ -16,7 +17,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.protocols.servers.commands import CommandHandler, ReceivedCommand, to_int
-from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
 from aerokit.protocols.servers.intervals import Builder
 
 _Can = GimbalDeviceCapFlags
@@ -30,10 +31,16 @@ ALL_CAPABILITIES = (
 _VERSION = 1 << 24
 
 
-Owner = tuple[int, int]
 Angles = tuple[float, float, float]
-Place = tuple[int, int, float]  # latitude and longitude in degrees times 1e7, altitude above mean sea level in metres
-_NOBODY: Owner = (0, 0)
+_NOBODY = ComponentIds()
+
+
+class Place(NamedTuple):
+    """A position: latitude and longitude in degrees times 1e7, altitude above mean sea level in metres."""
+
+    latitude_e7: int
+    longitude_e7: int
+    altitude_m: float
 
 
 class GimbalMount:
@@ -50,10 +57,10 @@ class GimbalMount:
     limits: tuple[tuple[float, float], ...]
     """Minimum and maximum of roll, pitch and yaw in radians."""
     slew_rad_s: float
-    primary: Owner = _NOBODY
-    """System and component id of the component in control; zeros if none."""
-    secondary: Owner = _NOBODY
-    """System and component id of the component in secondary control; zeros if none."""
+    primary: ComponentIds = _NOBODY
+    """The component in control; zeros if none."""
+    secondary: ComponentIds = _NOBODY
+    """The component in secondary control; zeros if none."""
     flags: int = 0
     """GIMBAL_MANAGER_FLAGS of the latest command."""
 
@@ -108,25 +115,24 @@ class GimbalMount:
     def update_followed(self, system_id: int, place: Place) -> None:
         """Update the position of the followed vehicle."""
 
-    def set_control(self, primary: Owner, secondary: Owner) -> None:
+    def set_control(self, primary: ComponentIds, secondary: ComponentIds) -> None:
         """Set primary and secondary control; a change is announced at once."""
         if (primary, secondary) != (self.primary, self.secondary):
             self.primary = primary
             self.secondary = secondary
             self.host.send(gimbal_manager_status(self))
 
-    def is_in_control(self, sender: Owner) -> bool:
+    def is_in_control(self, sender: ComponentIds) -> bool:
         """Return True if this sender is in control."""
         return sender in (self.primary, self.secondary) and sender != _NOBODY
 
 
 def gimbal_manager_status(gimbal: GimbalMount) -> m.GimbalManagerStatus:
-    primary_system, primary_component = gimbal.primary
-    secondary_system, secondary_component = gimbal.secondary
+    primary, secondary = gimbal.primary, gimbal.secondary
     return m.GimbalManagerStatus(
         time_boot_ms=gimbal.host.time_boot_ms, flags=_flags(gimbal), gimbal_device_id=gimbal.device_id,
-        primary_control_sysid=primary_system, primary_control_compid=primary_component,
-        secondary_control_sysid=secondary_system, secondary_control_compid=secondary_component,
+        primary_control_sysid=primary.system, primary_control_compid=primary.component,
+        secondary_control_sysid=secondary.system, secondary_control_compid=secondary.component,
     )  # fmt: skip
 
 
@@ -185,6 +191,9 @@ class GimbalRequests:
     def _selects_gimbal(self, device_id: float) -> bool:
         return to_int(device_id) in (0, self._gimbal.device_id)  # 0 selects all gimbals.
 
+    def _may_control(self, sender: ComponentIds, device_id: float) -> bool:
+        return self._selects_gimbal(device_id) and self._gimbal.is_in_control(sender)
+
     def configure(self, command: ReceivedCommand) -> int:
         gimbal, sender = self._gimbal, command.sender
         ids = (command.param1, command.param2, command.param3, command.param4)
@@ -192,13 +201,13 @@ class GimbalRequests:
             return MavResult.DENIED
         primary_system, primary_component, secondary_system, secondary_component = map(int, ids)
         gimbal.set_control(
-            primary=_owner(gimbal.primary, (primary_system, primary_component), sender),
-            secondary=_owner(gimbal.secondary, (secondary_system, secondary_component), sender),
+            primary=_owner(gimbal.primary, ComponentIds(primary_system, primary_component), sender),
+            secondary=_owner(gimbal.secondary, ComponentIds(secondary_system, secondary_component), sender),
         )
         return MavResult.ACCEPTED
 
     def pitch_and_yaw(self, command: ReceivedCommand) -> int:
-        if not self._selects_gimbal(command.z) or not self._gimbal.is_in_control(command.sender):
+        if not self._may_control(command.sender, command.z):
             return MavResult.DENIED
         pitch, yaw, pitch_rate, yaw_rate = map(
             math.radians, (command.param1, command.param2, command.param3, command.param4)
@@ -211,8 +220,7 @@ class GimbalRequests:
         """Return the MAV_RESULT that refuses the command, or None."""
         if not self._gimbal.can_point_at_positions:
             return MavResult.UNSUPPORTED
-        is_allowed = self._selects_gimbal(device_id) and self._gimbal.is_in_control(command.sender)
-        return None if is_allowed else MavResult.DENIED
+        return None if self._may_control(command.sender, device_id) else MavResult.DENIED
 
     def look_at(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal
@@ -227,7 +235,7 @@ class GimbalRequests:
         altitude = command.z
         if frame not in _ABSOLUTE_FRAMES:
             altitude += gimbal.home_altitude_m()
-        gimbal.look_at((*command.place(), altitude))
+        gimbal.look_at(Place(*command.place(), altitude))
         return MavResult.ACCEPTED
 
     def follow(self, command: ReceivedCommand) -> int:
@@ -240,8 +248,8 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
-        system_id, _component = sender_of(message)
-        self._gimbal.update_followed(system_id, (message.lat, message.lon, message.alt * 1e-3))
+        place = Place(message.lat, message.lon, message.alt * 1e-3)
+        self._gimbal.update_followed(sender_of(message).system, place)
 
     def look_ahead(self, command: ReceivedCommand) -> int:
         if (refusal := self._refusal(command.param1, command)) is not None:
@@ -264,13 +272,13 @@ class GimbalRequests:
         return True
 
     def on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        if self._selects_gimbal(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+        if self._may_control(sender_of(message), message.gimbal_device_id):
             self._apply_attitude(message)
 
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
         # The sender is another manager, such as an autopilot. It may set the attitude if it is in control, or if no
         # component is.
-        if self._gimbal.primary in ((0, 0), sender_of(message)):
+        if self._gimbal.primary in (_NOBODY, sender_of(message)):
             self._apply_attitude(message)
 
     def _apply_attitude(self, message: m.GimbalManagerSetAttitude | m.GimbalDeviceSetAttitude) -> None:
@@ -280,23 +288,23 @@ class GimbalRequests:
         self.apply(message.flags, (roll, pitch, yaw), rates)
 
     def on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        if self._selects_gimbal(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+        if self._may_control(sender_of(message), message.gimbal_device_id):
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        gimbal = self._gimbal
-        if self._selects_gimbal(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
+        if self._may_control(sender_of(message), message.gimbal_device_id):
             # The angles are taken as radians. The rates are fractions of the slew rate, from -1 to 1.
-            rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
+            slew_rad_s = self._gimbal.slew_rad_s
+            rates = (0.0, message.pitch_rate * slew_rad_s, message.yaw_rate * slew_rad_s)
             self.apply(message.flags, (0.0, message.pitch, message.yaw), rates)
 
 
-def _owner(current: Owner, requested: tuple[int, int], sender: Owner) -> Owner:
+def _owner(current: ComponentIds, requested: ComponentIds, sender: ComponentIds) -> ComponentIds:
     """Return the component that has control after a request for these ids."""
     if _SENDER in requested:
         return sender
     if _RELEASE in requested:  # Only the component that has control can release it.
-        return (0, 0) if current == sender else current
+        return _NOBODY if current == sender else current
     if _UNCHANGED in requested:
         return current
     return requested

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from aerokit.mavlink.message import Message
 
 # Where a message came from, and where its answer is sent. Only the host knows the type.
 Channel = Any
 Handler = Callable[[Any, Channel], None]
+
+
+class ComponentIds(NamedTuple):
+    """System id and component id of a MAVLink component; zeros if there is none."""
+
+    system: int = 0
+    component: int = 0
 
 
 class ServerHost(Protocol):
@@ -40,7 +47,7 @@ class ServerHost(Protocol):
     def call_later(self, delay: float, action: Callable[[], None]) -> None: ...
 
 
-def sender_of(message: Message) -> tuple[int, int]:
-    """Return system and component id of the sender. They are 0 if the message was not received."""
+def sender_of(message: Message) -> ComponentIds:
+    """Return the ids of the sender. They are 0 if the message was not received."""
     frame = message.received_frame
-    return (0, 0) if frame is None else (frame.system_id, frame.component_id)
+    return ComponentIds() if frame is None else ComponentIds(frame.system_id, frame.component_id)

@@ -12,7 +12,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import from_wire, to_wire, to_wire_float
-from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
 
 AnyItem = m.MissionItemInt | m.MissionItem
 AnyRequest = m.MissionRequestInt | m.MissionRequest
@@ -26,20 +26,18 @@ def item_from(message: AnyItem) -> MissionItem:
 
 
 def item_message_int(
-    item: MissionItem, seq: int, to: tuple[int, int], mission_type: int, *, current: bool
+    item: MissionItem, seq: int, to: ComponentIds, mission_type: int, *, current: bool
 ) -> m.MissionItemInt:
-    system, component = to
     return to_wire(
-        item, seq, target_system=system, target_component=component, mission_type=mission_type, current=current
+        item, seq, target_system=to.system, target_component=to.component, mission_type=mission_type, current=current
     )
 
 
 def item_message_float(
-    item: MissionItem, place: tuple[float, float], seq: int, to: tuple[int, int], mission_type: int, current: int = 0
+    item: MissionItem, place: tuple[float, float], seq: int, to: ComponentIds, mission_type: int, current: int = 0
 ) -> m.MissionItem:
-    system, component = to
     return to_wire_float(
-        item, seq, target_system=system, target_component=component, mission_type=mission_type, current=current,
+        item, seq, target_system=to.system, target_component=to.component, mission_type=mission_type, current=current,
         place=place,
     )  # fmt: skip
 
@@ -58,7 +56,7 @@ Validator = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None
 class ListUpload:
     """A list that a client uploads."""
 
-    client: tuple[int, int]
+    client: ComponentIds
     channel: Channel
     mission_type: int
     next: int
@@ -137,8 +135,10 @@ class MissionServer:
         """Return the opaque id of a list, a checksum of its items. It is 0 for an empty list."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
-            messages = (_item_message(item, seq, (0, 0), mission_type, current=False) for seq, item in enumerate(items))
-            checksum = zlib.crc32(b"".join(message.encode() for message in messages))
+            checksum = 0
+            for seq, item in enumerate(items):
+                message = _item_message(item, seq, ComponentIds(), mission_type, current=False)
+                checksum = zlib.crc32(message.encode(), checksum)
             self._opaque_ids[mission_type] = checksum or 1  # 0 means no id
         return self._opaque_ids[mission_type] if items else 0
 
@@ -178,13 +178,12 @@ class MissionServer:
         return items[seq] if 0 <= seq < len(items) else _Result.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        seq, kind = request.seq, request.mission_type
-        system, component = sender_of(request)
+        seq, kind, to = request.seq, request.mission_type, sender_of(request)
         current = seq == self.current and kind == MavMissionType.MISSION
         if isinstance(request, m.MissionRequestInt):
-            return _item_message(item, seq, (system, component), kind, current=current)
+            return _item_message(item, seq, to, kind, current=current)
         return to_wire_float(
-            item, seq, target_system=system, target_component=component, mission_type=kind, current=current
+            item, seq, target_system=to.system, target_component=to.component, mission_type=kind, current=current
         )
 
     def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
@@ -197,18 +196,15 @@ class MissionServer:
         """Return the key of an upload. Uploads with different keys can run at the same time."""
         return 0
 
-    def _acknowledge(self, to: tuple[int, int], kind: int, result: int, channel: Channel, opaque_id: int = 0) -> None:
-        system, component = to
-        self._host.send(m.MissionAck(system, component, result, kind, opaque_id=opaque_id), channel)
+    def _acknowledge(self, to: ComponentIds, kind: int, result: int, channel: Channel, opaque_id: int = 0) -> None:
+        self._host.send(m.MissionAck(*to, result, kind, opaque_id=opaque_id), channel)
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         kind, to = request.mission_type, sender_of(request)
         if (refusal := self._refusal(request, channel)) is not None:
             self._acknowledge(to, kind, refusal, channel)
         else:
-            system, component = to
-            count = m.MissionCount(system, component, self.count(kind), kind, opaque_id=self.id(kind))
-            self._host.send(count, channel)
+            self._host.send(m.MissionCount(*to, self.count(kind), kind, opaque_id=self.id(kind)), channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         refusal = self._refusal(request, channel)
@@ -270,8 +266,7 @@ class MissionServer:
     def _request_item(self, upload: ListUpload) -> None:
         upload.requested_at = self._host.now
         request_class = m.MissionRequestInt if upload.uses_int else m.MissionRequest
-        system, component = upload.client
-        self._host.send(request_class(system, component, upload.next, upload.mission_type), upload.channel)
+        self._host.send(request_class(*upload.client, upload.next, upload.mission_type), upload.channel)
 
     def _watch(self, upload: ListUpload) -> None:
         """Schedule the next retry or the time-out."""
@@ -399,7 +394,7 @@ class MissionServer:
 
 
 def _item_message(
-    item: MissionItem, seq: int, to: tuple[int, int], mission_type: int, *, current: bool
+    item: MissionItem, seq: int, to: ComponentIds, mission_type: int, *, current: bool
 ) -> m.MissionItemInt:
     rounded = item.replace(x=round(item.x), y=round(item.y))
     return item_message_int(rounded, seq, to, mission_type, current=current)

@@ -6,14 +6,14 @@ https://mavlink.io/en/services/parameter.html, https://mavlink.io/en/services/pa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamError, MavParamExtType, ParamAck
 from aerokit.parameters import Parameter, ParameterType, SettingValue
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
-from aerokit.protocols.servers.host import Channel, ServerHost, sender_of
+from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
 
 MAX_LISTS = 8
 """Maximum number of lists that a component sends at once; it ignores further requests."""
@@ -79,15 +79,15 @@ class ParameterLists:
             return
         self._host.call_later(self._group_interval_s, lambda: self._send_group(end, channel, number))
 
-    def requested(self, name: str, index: int) -> tuple[str, int] | None:
-        """Return name and index of the requested parameter, or None if there is no such parameter.
-
-        ``index`` selects the parameter or, if it is negative, ``name``.
-        """
+    def send_requested(self, name: str, index: int, channel: Channel) -> bool:
+        """Send the parameter with this index or, if it is negative, with this name. Return False if there is none."""
         names = self._listed.names
-        if index < 0:
-            return (name, names.index(name)) if name in names else None
-        return (names[index], index) if index < len(names) else None
+        if index < 0 and name in names:
+            index = names.index(name)
+        if not 0 <= index < len(names):
+            return False
+        self.send(names[index], index, channel)
+        return True
 
     def send(self, name: str, index: int, channel: Channel) -> None:
         """Send a value on one channel, or on all channels (None)."""
@@ -118,15 +118,22 @@ class ParameterProtocolServer(ParameterLists):
     def send(self, name: str, index: int, channel: Channel) -> None:
         self._host.send(self.value_message(name, index), channel)
 
-    def send_error(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
+    def send_error(self, to: ComponentIds, name: str, index: int, code: int, channel: Channel) -> None:
         self._host.send(m.ParamError(*to, name, index, code), channel)
+
+
+class ParameterRefusal(NamedTuple):
+    """Reason why a value is not stored: a MAV_PARAM_ERROR, and the PARAM_ACK for the extended protocol."""
+
+    error: MavParamError
+    ack: ParamAck
 
 
 class TypedStore(NamedList, Protocol):
     """Typed parameters of a component."""
 
     @property
-    def small_names(self) -> Sequence[str]:
+    def param_names(self) -> Sequence[str]:
         """Names of the parameters whose values fit into PARAM_VALUE.
 
         This must be fast, because every PARAM_VALUE needs it.
@@ -139,13 +146,11 @@ class TypedStore(NamedList, Protocol):
 
     def type(self, name: str) -> MavParamExtType: ...
 
-    def problem(self, name: str, value: SettingValue, type: int) -> tuple[int, int] | None:  # noqa: A002
-        """Return MAV_PARAM_ERROR and PARAM_ACK if the value must not be stored, otherwise None."""
+    def refusal(self, name: str, value: SettingValue, type: int) -> ParameterRefusal | None:  # noqa: A002
+        """Return the reason if the value must not be stored, otherwise None."""
         ...
 
-    def store(self, name: str, value: SettingValue) -> None:
-        """Store a value that has no `problem`."""
-        ...
+    def store(self, name: str, value: SettingValue) -> None: ...
 
 
 class TypedParameterServer(ParameterProtocolServer):
@@ -162,7 +167,7 @@ class TypedParameterServer(ParameterProtocolServer):
 
     @property
     def names(self) -> Sequence[str]:
-        return self._store.small_names
+        return self._store.param_names
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
         value, type_ = self._store[name], ParameterType(self._store.type(name))
@@ -181,10 +186,7 @@ class TypedParameterServer(ParameterProtocolServer):
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
         name, index = request.param_id, request.param_index
-        name_and_index = self.requested(name, index)
-        if name_and_index is not None:
-            self.send(*name_and_index, channel)
-        else:
+        if not self.send_requested(name, index, channel):
             unknown_name = name if index < 0 else ""
             self.send_error(sender_of(request), unknown_name, index, MavParamError.DOES_NOT_EXIST, channel)
 
@@ -195,10 +197,9 @@ class TypedParameterServer(ParameterProtocolServer):
             return
         value = value_of(request, bytewise=self.bytewise)
         # If values are cast to float, the received type is ignored: ArduPilot's clients send all values as REAL32.
-        problem = store.problem(name, value, request.param_type if self.bytewise else store.type(name))
-        if problem is not None:
-            param_error, _ = problem
-            self.send_error(sender_of(request), name, names.index(name), param_error, channel)
+        refusal = store.refusal(name, value, request.param_type if self.bytewise else store.type(name))
+        if refusal is not None:
+            self.send_error(sender_of(request), name, names.index(name), refusal.error, channel)
             self.send(name, names.index(name), channel)
             return
         old_value = store[name]
@@ -232,8 +233,11 @@ class ExtendedParameterServer(ParameterLists):
         """Return value and MAV_PARAM_EXT_TYPE."""
         raise NotImplementedError
 
-    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        """Set a value. Return what the reply reports: PARAM_ACK, the encoded value and its MAV_PARAM_EXT_TYPE."""
+    def __contains__(self, name: object) -> bool:
+        raise NotImplementedError
+
+    def set(self, name: str, data: bytes, kind: int) -> int:
+        """Set a known parameter, and return the PARAM_ACK."""
         raise NotImplementedError
 
     def _on_list(self, _: m.ParamExtRequestList, channel: Channel) -> None:
@@ -241,9 +245,7 @@ class ExtendedParameterServer(ParameterLists):
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamExtRequestRead, channel: Channel) -> None:
-        name_and_index = self.requested(request.param_id, request.param_index)
-        if name_and_index is not None:
-            self.send(*name_and_index, channel)
+        self.send_requested(request.param_id, request.param_index, channel)
 
     def send(self, name: str, index: int, channel: Channel) -> None:
         value, kind = self.value(name)
@@ -251,13 +253,18 @@ class ExtendedParameterServer(ParameterLists):
         self._host.send(m.ParamExtValue(name, setting_bytes(value, kind), kind, len(names), index), channel)
 
     def _on_set(self, request: m.ParamExtSet, _: Channel) -> None:
-        result, data, kind = self.set(request.param_id, request.param_value, request.param_type)
-        self.acknowledge(request.param_id, data, kind, result)
+        name, data, kind = request.param_id, request.param_value, request.param_type
+        if name in self:
+            self.acknowledge(name, self.set(name, data, kind))
+        else:
+            known_type = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
+            self._host.send(m.ParamExtAck(name, data, known_type, ParamAck.VALUE_UNSUPPORTED))
 
-    def acknowledge(self, name: str, data: bytes, kind: int, result: int) -> None:
+    def acknowledge(self, name: str, result: int) -> None:
+        """Send the result of a change, with the present value."""
+        value, kind = self.value(name)
         # All channels get the acknowledgement, because other clients read changes from it.
-        known_type = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
-        self._host.send(m.ParamExtAck(name, data, known_type, result))
+        self._host.send(m.ParamExtAck(name, setting_bytes(value, kind), kind, result))
 
 
 class TypedExtendedServer(ExtendedParameterServer):
@@ -270,17 +277,15 @@ class TypedExtendedServer(ExtendedParameterServer):
     def value(self, name: str) -> tuple[SettingValue, int]:
         return self._store[name], self._store.type(name)
 
-    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        store = self._store
-        if name not in store:
-            return ParamAck.VALUE_UNSUPPORTED, data, kind
-        value = setting_value(data, kind)
+    def __contains__(self, name: object) -> bool:
+        return name in self._store
+
+    def set(self, name: str, data: bytes, kind: int) -> int:
+        store, value = self._store, setting_value(data, kind)
         if isinstance(store[name], str) and value == b"":  # An empty text and empty bytes are the same on the wire.
             value = ""
-        problem = store.problem(name, value, kind)
-        if problem is None:
-            store.store(name, value)
-            result: int = ParamAck.ACCEPTED
-        else:
-            _, result = problem
-        return result, setting_bytes(store[name], store.type(name)), store.type(name)
+        refusal = store.refusal(name, value, kind)
+        if refusal is not None:
+            return refusal.ack
+        store.store(name, value)
+        return ParamAck.ACCEPTED

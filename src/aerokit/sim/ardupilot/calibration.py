@@ -113,7 +113,7 @@ class CompassCalibration:
 
     @property
     def is_running(self) -> bool:
-        """True until the progress reaches 100 %."""
+        """True from the start until the progress reaches 100 %."""
         return bool(self._compass_mask) and self.percent < 100
 
     @property

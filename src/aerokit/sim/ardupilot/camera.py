@@ -121,9 +121,11 @@ class ArduPilotCamera:
             self.stop()
 
     def _start(self, interval_s: float, count: float) -> bool:
-        if count == 1.0 or (interval_s == 0.0 and count == 0.0):
+        is_single_image = count == 1.0 or (interval_s == 0.0 and count == 0.0)
+        if is_single_image:
             return self.take()
-        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, to_int(count) or _UNLIMITED)
+        finite_interval_s = interval_s if math.isfinite(interval_s) else 0.0
+        return self.take_series(finite_interval_s, to_int(count) or _UNLIMITED)
 
     def start_capture(self, command: ReceivedCommand) -> int:
         # Param 1 is the number of the camera. 0 selects all cameras.

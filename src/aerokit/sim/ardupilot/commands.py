@@ -1,6 +1,6 @@
 """Commands (MAV_CMD) that all simulated ArduPilots implement, with the conditions and results of the firmware.
 
-Results are those of a vehicle without gripper, winch and lifting rotors.
+Results are those of a vehicle without lifting rotors.
 """
 
 from __future__ import annotations
@@ -262,7 +262,7 @@ class HomeAndOrigin:
             return self._make_home(vehicle.motion.place) if nav.has_position else Result.FAILED
         if command.param1 != 0.0:
             return Result.FAILED
-        # COMMAND_LONG has no frame, and the firmware takes its altitude as AMSL.
+        # COMMAND_LONG has no frame. The firmware takes the altitude as AMSL.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         if frame not in _FRAMES:
             vehicle.info(f"Unknown mavlink coordinate frame {frame}")

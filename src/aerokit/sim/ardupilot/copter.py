@@ -48,13 +48,9 @@ class MotorTest:
 
     def command(self, command: ReceivedCommand) -> int:
         if not self.is_running:
-            reason = ""
-            if not self._copter.is_initialised:
-                reason = "Board initialising"
-            elif not self._copter.is_landed:
-                reason = "vehicle not landed"
-            if reason:
-                self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {reason}")
+            obstacle = self._obstacle()
+            if obstacle is not None:
+                self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {obstacle}")
                 return MavResult.FAILED
             self._copter.info("starting motor test")
         self.is_running = True
@@ -62,6 +58,11 @@ class MotorTest:
         # `_stop` compares the number, so that the end of this test does not stop a newer test.
         self._copter.call_later(self._duration_s(command), partial(self._stop, self._test_number))
         return MavResult.ACCEPTED
+
+    def _obstacle(self) -> str | None:
+        if not self._copter.is_initialised:
+            return "Board initialising"
+        return None if self._copter.is_landed else "vehicle not landed"
 
     def _duration_s(self, command: ReceivedCommand) -> float:
         throttle_type, throttle = command.param2, command.param3
@@ -221,10 +222,10 @@ class SimulatedCopter(CopterHost):
             return _BASE | _GUIDED
         flags = _BASE
         mode_name = self.mode.name
-        # GUIDED_ENABLED is set in modes that use a position. In RTL, it is set only while armed, not in a motor test.
-        if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
+        is_disarmed_return = mode_name == "RTL" and not self.motors.is_armed
+        if mode_name in _GUIDED_MODES and not is_disarmed_return:
             flags |= _GUIDED
-        if self.is_armed:
+        if self.is_armed:  # also during a motor test
             flags |= _ARMED
         return flags
 

@@ -22,7 +22,8 @@ from aerokit.sim.ardupilot.mission_run import MissionCommand, MissionMode, horiz
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
-_TAKE_OFF_WITHOUT_THROTTLE, _RAISED_THROTTLE = 2, 1100  # A bit of AUTO_OPTIONS, and a pulse in µs.
+_TAKE_OFF_WITHOUT_THROTTLE = 2  # bit of AUTO_OPTIONS
+_RAISED_THROTTLE_PWM = 1100
 # A turn on a circle uses at most this share of the acceleration limit. The rest corrects the distance from the circle.
 _TURN_SHARE_OF_ACCELERATION = 0.7
 
@@ -89,7 +90,7 @@ class _CircleLeg:
         self._angle += rate * dt
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
-        # Follow a point on the circle: command the velocity of the point, plus 1 m/s for each metre of distance.
+        # Follow a point on the circle with the velocity of the point, plus 1 m/s for each metre of distance to it.
         north, east, down = self._point()
         speed = rate * self._radius
         velocity_north = -speed * math.sin(self._angle)
@@ -125,7 +126,7 @@ class _ClimbLeg:
         copter, auto = self._copter, self._auto
         options = int(copter.parameters["AUTO_OPTIONS"])
         # On the ground, the copter waits for MISSION_START or a raised throttle.
-        if copter.rc[RC_THROTTLE] > _RAISED_THROTTLE or options & _TAKE_OFF_WITHOUT_THROTTLE:
+        if copter.rc[RC_THROTTLE] > _RAISED_THROTTLE_PWM or options & _TAKE_OFF_WITHOUT_THROTTLE:
             auto.may_lift_off = True
         if not copter.is_landed or auto.may_lift_off:
             self._take_off.update(auto.climb)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from aerokit.mavlink.enums import CopterMode, FenceMitigate, FenceType, MavSeverity
 from aerokit.sim.ardupilot.copter_modes import CopterHost
@@ -26,7 +26,8 @@ class CopterArming(ArduPilotArming[CopterHost]):
 
     def position_reasons(self) -> Sequence[str]:
         needs_gps = self.vehicle.mode.needs_position or self._fence_needs_position
-        return (super().position_reasons() if needs_gps else ()) or self.mandatory_reasons()
+        gps_reasons = super().position_reasons() if needs_gps else ()
+        return gps_reasons or self.mandatory_reasons()
 
     def own_reasons(self) -> list[str]:
         reasons = []
@@ -62,8 +63,9 @@ class CopterArming(ArduPilotArming[CopterHost]):
             return [f"{mode.name} mode not armable"]
         # In modes without manual throttle, the stick sets a climb rate, and its center holds the altitude.
         max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTER + _DEADZONE
+        is_throttle_high = self.vehicle.rc[RC_THROTTLE] > max_throttle
         is_throttle_checked = self.is_checked(ArmingCheck.RC) and not mode.arms_with_raised_throttle
-        return ["Throttle too high"] if is_throttle_checked and self.vehicle.rc[RC_THROTTLE] > max_throttle else []
+        return ["Throttle too high"] if is_throttle_checked and is_throttle_high else []
 
 
 _NONE, _LAND, _RTL, _SMART_RTL, _SMART_RTL_OR_LAND, _TERMINATE, _AUTO, _BRAKE = range(8)
@@ -83,16 +85,24 @@ _FALLBACK_TEXTS = {
     _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
     _BRAKE: "Trying Land Mode",
 }
-# Bits of FS_OPTIONS that let a flight continue in spite of a failsafe. The rows of the tables have the modes in which
-# the bit applies, the bit, and the status text.
-_CONTINUES_LANDING = 8
+
+
+class _ContinueOption(NamedTuple):
+    """Bit of FS_OPTIONS that lets a flight in one of the modes continue in spite of a failsafe, and the status text."""
+
+    modes: frozenset[str]
+    bit: int
+    text: str
+
+
+_CONTINUES_LANDING = 8  # bit of FS_OPTIONS
 _RADIO_OPTIONS = (
-    (frozenset({"AUTO"}), 1, "Continuing Auto"),
-    (frozenset({"GUIDED"}), 4, "Continuing Guided Mode"),
+    _ContinueOption(frozenset({"AUTO"}), 1, "Continuing Auto"),
+    _ContinueOption(frozenset({"GUIDED"}), 4, "Continuing Guided Mode"),
 )
 _GCS_OPTIONS = (
-    (frozenset({"AUTO"}), 2, "Continuing Auto Mode"),
-    (frozenset({"STABILIZE", "ALT_HOLD", "LOITER", "POSHOLD"}), 16, "Continuing Pilot Control"),
+    _ContinueOption(frozenset({"AUTO"}), 2, "Continuing Auto Mode"),
+    _ContinueOption(frozenset({"STABILIZE", "ALT_HOLD", "LOITER", "POSHOLD"}), 16, "Continuing Pilot Control"),
 )
 _MIN_GOOD_S = 0.2
 _ESTIMATOR_TIMEOUT_S = 1.0
@@ -179,8 +189,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         value = int(self.vehicle.parameters[parameter])
         return _LINK_ACTIONS[value] if 0 <= value < len(_LINK_ACTIONS) else default
 
-    def _action_after_loss(self, name: str, action: int, options: Sequence[tuple[frozenset[str], int, str]]) -> int:
-        """Report the loss of the link ``name`` and return the action to execute."""
+    def _action_after_loss(self, name: str, action: int, options: Sequence[_ContinueOption]) -> int:
+        """Report the loss of the link ``name``. Return the action to execute, by default ``action``."""
         mode = self.vehicle.mode
         if self._disarm_if_landed(name):
             return _NONE
@@ -191,9 +201,9 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
                 return self._report_continuation(f"{name} + Battery", "Continuing Landing", _LAND)
             if self._has_option(_CONTINUES_LANDING):
                 return self._report_continuation(name, "Continuing Landing", _LAND)
-        for modes, bit, text in options:
-            if mode.name in modes and self._has_option(bit):
-                return self._report_continuation(name, text)
+        for option in options:
+            if mode.name in option.modes and self._has_option(option.bit):
+                return self._report_continuation(name, option.text)
         self.warn(f"{name} Failsafe")
         return action
 
@@ -216,7 +226,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
                 self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
             self.has_estimator_failed = self._acted_on_estimator = False
             return
-        if not self._had_position or self.has_estimator_failed:  # Act once, and only on the loss of a position.
+        can_start = self._had_position and not self.has_estimator_failed
+        if not can_start:
             return
         lost_for_s = self._position_lost.seconds(condition=True, now=copter.now)
         if lost_for_s >= _ESTIMATOR_TIMEOUT_S:

@@ -31,8 +31,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    DO_CHANGE_SPEED sets a speed limit. As in ArduCopter, another type of target (position, velocity or acceleration)
-    resets the limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
+    DO_CHANGE_SPEED sets a speed limit. When the type of target changes (position, velocity, acceleration), the limits
+    are WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN again, as in ArduCopter.
     """
 
     number: int = CopterMode.GUIDED
@@ -201,13 +201,14 @@ class CopterGuided(CopterModeBase):
             # velocity.
             offsets = (target - current for target, current in zip(self.position, motion.place, strict=True))
             north, east, down = (speed + offset for speed, offset in zip(self.velocity, offsets, strict=True))
-            self._seek_velocity(north, east, down)
+            self._seek_velocity(north, east, down, acceleration=self.acceleration)
 
-    def _seek_velocity(self, north: float, east: float, down: float) -> None:
+    def _seek_velocity(self, north: float, east: float, down: float, *, acceleration: Ned = _ZERO) -> None:
         horizontal_speed = math.hypot(north, east)
         if horizontal_speed > self.speed:
             north, east = north * self.speed / horizontal_speed, east * self.speed / horizontal_speed
-        self.vehicle.motion.seek_velocity(north, east, max(-self.climb, min(self.descent, down)))
+        down = max(-self.climb, min(self.descent, down))
+        self.vehicle.motion.follow_trajectory((north, east, down), acceleration)
 
 
 _BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
@@ -300,8 +301,8 @@ class CopterSetpoints:
             copter.motion.face(yaw)
         elif not ignored_rates:
             copter.motion.turn(target.body_yaw_rate)
-        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. Bit 3 of GUID_OPTIONS, which would make it
-        # set the throttle, is not simulated.
+        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. Bit 3 of GUID_OPTIONS, with which `thrust`
+        # sets the throttle, is not simulated.
         climb_share = (constrained(target.thrust, 0.0, 1.0) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0

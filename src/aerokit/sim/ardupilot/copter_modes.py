@@ -72,7 +72,7 @@ class AutoYaw:
         self._control = self._turn
 
     def set_region_of_interest(self, point: Ned | None) -> None:
-        """Face a place. None ends this."""
+        """Face a place. With None, apply the default heading again."""
         gimbal = self._copter.gimbal
         # A fitted gimbal turns instead of the copter.
         gimbal.look_at(point)
@@ -318,7 +318,10 @@ class CopterLand(CopterModeBase):
 
 
 class CopterRtl(CopterModeBase):
-    """RTL: climbs to RTL_ALT (less near home), flies to home or a rally point, waits for RTL_LOIT_TIME and lands."""
+    """RTL: climbs to RTL_ALT, flies to home or a rally point, waits for RTL_LOIT_TIME and lands.
+
+    Near the destination, a lower altitude suffices (RTL_CONE_SLOPE).
+    """
 
     can_arm = False
     can_change_speed = True
@@ -355,7 +358,7 @@ class CopterRtl(CopterModeBase):
         current = self.vehicle.navigation.altitude_above_home
         after_min_climb = current + parameters["RTL_CLIMB_MIN"] / 100.0
         target = max(after_min_climb, parameters["RTL_ALT"] / 100.0, _RTL_MIN_ALTITUDE_M)
-        if parameters["RTL_CONE_SLOPE"] > 0:  # Close to the destination, a lower altitude suffices.
+        if parameters["RTL_CONE_SLOPE"] > 0:
             altitude_of_cone = distance * parameters["RTL_CONE_SLOPE"]
             target = min(target, max(altitude_of_cone, _RTL_MIN_ALTITUDE_M))
         return max(target, current)  # A return never begins with a descent.

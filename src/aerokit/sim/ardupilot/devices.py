@@ -28,7 +28,7 @@ class ArduPilotDevices:
         self.line_m: float = 0.0  # Length of the winch's line.
         self.line_rate_m_s: float = 0.0  # Above 0 while the winch lets out line.
         self._goal_m: float | None = None  # Length at which the winch stops; None if it stops only on command.
-        self._has_scheduled_step = False  # True while a step of the line is scheduled, even after RELAXED
+        self._is_step_scheduled = False  # True while `_move_line` is scheduled
 
     def _is_set(self, name: str) -> bool:
         return bool(self._vehicle.parameters.get(name, 0))
@@ -86,18 +86,19 @@ class ArduPilotDevices:
         if action == WinchActions.RATE_CONTROL:
             self.line_rate_m_s = constrained(rate_m_s, -_WINCH_RATE_M_S, _WINCH_RATE_M_S)
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
+            direction = (length_m > 0) - (length_m < 0)  # 1, 0 or -1; 0 for NaN
             self._goal_m = self.line_m + length_m
-            self.line_rate_m_s = _WINCH_RATE_M_S * ((length_m > 0) - (length_m < 0))  # 0 for NaN
+            self.line_rate_m_s = _WINCH_RATE_M_S * direction
         self._schedule_step()
         return Result.ACCEPTED
 
     def _schedule_step(self) -> None:
-        if self.line_rate_m_s and not self._has_scheduled_step:
-            self._has_scheduled_step = True
-            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
+        if self.line_rate_m_s and not self._is_step_scheduled:
+            self._is_step_scheduled = True
+            self._vehicle.call_later(_WINCH_INTERVAL_S, self._move_line)
 
-    def _run(self) -> None:
-        self._has_scheduled_step = False
+    def _move_line(self) -> None:
+        self._is_step_scheduled = False
         self.line_m += self.line_rate_m_s * _WINCH_INTERVAL_S
         # Once the line has passed the goal, the remaining length and the rate have opposite signs.
         if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:

@@ -32,8 +32,7 @@ class ArduPilotExternal:
         self.latest: dict[type[Message], Message] = {}
         self._navigation_at = self._target_at = -math.inf  # times of the last measurements
         self._target: tuple[float, float] = (0.0, 0.0)  # (north, east) of the landing target
-        # Wind speed in m/s, and the direction in degrees from which the wind comes.
-        # The wind has no effect on the flight.
+        # Wind speed in m/s, and the direction in degrees from which the wind comes. The flight is not affected.
         self.wind: tuple[float, float] | None = None
 
     def listen(self) -> None:
@@ -76,12 +75,11 @@ class ArduPilotExternal:
         if target.position_valid and not target.distance > 0:  # The firmware would divide by 0.
             return
         self.latest[type(target)] = target
-        # The offset of the target is relative to the nose, so it is rotated by the heading.
         offset = (target.x, target.y, target.z)
         if not target.position_valid:  # Only the angles from the downward axis are known.
             height = motion.ground_down - motion.down
             offset = (-math.tan(target.angle_y) * height, math.tan(target.angle_x) * height, height)
-        north, east, _down = rotated(offset, motion.yaw)
+        north, east, _down = rotated(offset, motion.yaw)  # The offset is relative to the nose.
         self._target = (motion.north + north, motion.east + east)
         self._target_at = self._vehicle.now
 

@@ -11,11 +11,10 @@ from aerokit.mavlink.enums import GpsFixType, MavSeverity
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotHost, ConditionTimer, HostT
 
 _OK, _LOW, _CRITICAL = 0, 1, 2
-# Names of the levels: `_NAMES` in parameter names, `_WORDS` in status texts.
-_NAMES = {_LOW: "LOW", _CRITICAL: "CRT"}
+_NAMES_IN_PARAMETERS = {_LOW: "LOW", _CRITICAL: "CRT"}
+_NAMES_IN_TEXTS = {_LOW: "low", _CRITICAL: "critical"}
 # Parameters with the lowest voltage and charge of each level.
 _LIMITS = {_LOW: ("BATT_LOW_VOLT", "BATT_LOW_MAH"), _CRITICAL: ("BATT_CRT_VOLT", "BATT_CRT_MAH")}
-_WORDS = {_LOW: "low", _CRITICAL: "critical"}
 _PERIOD_S = 0.1
 
 
@@ -44,8 +43,8 @@ class BatteryFailsafe:
         self.level = level
         battery = self._vehicle.battery
         used = f"{battery.voltage_v:.2f}V used {battery.consumed_mah:.0f} mAh"
-        self._vehicle.send_text(MavSeverity.WARNING, f"Battery 1 is {_WORDS[level]} {used}")
-        action = int(self._vehicle.parameters[f"BATT_FS_{_NAMES[level]}_ACT"])
+        self._vehicle.send_text(MavSeverity.WARNING, f"Battery 1 is {_NAMES_IN_TEXTS[level]} {used}")
+        action = int(self._vehicle.parameters[f"BATT_FS_{_NAMES_IN_PARAMETERS[level]}_ACT"])
         priority = self._priorities.index(action) if action in self._priorities else len(self._priorities)
         is_at_least_as_severe = priority <= self.priority  # The most severe action has the index 0.
         if is_at_least_as_severe:
@@ -58,7 +57,7 @@ class BatteryFailsafe:
             return "Battery 1 below minimum arming voltage"
         if self._remaining_mah() < parameters["BATT_ARM_MAH"]:
             return "Battery 1 below minimum arming capacity"
-        for level, word in _WORDS.items():
+        for level, word in _NAMES_IN_TEXTS.items():
             is_voltage_low, is_charge_low = self._low_quantities(level)
             if is_voltage_low:
                 return f"Battery 1 {word} voltage failsafe"
@@ -114,11 +113,11 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def battery_is_low(self) -> bool:
-        return self.battery.level > 0
+        return self.battery.level >= _LOW
 
     @property
     def battery_is_critical(self) -> bool:
-        return self.battery.level > 1
+        return self.battery.level >= _CRITICAL
 
     @property
     def is_any_active(self) -> bool:
@@ -303,11 +302,7 @@ class ArduPilotArming(Generic[HostT]):
     def arm(self, *, force: bool = False) -> bool:
         """Arm and return True, or report the failing checks and return False."""
         vehicle = self.vehicle
-        reasons = self.mandatory_reasons() if force else self.reasons()
-        if not reasons and not force:
-            reasons = self.final_reasons()
-        if not vehicle.is_initialised:  # This text replaces the reasons of the checks.
-            reasons = ["System not initialised"]
+        reasons = self._reasons_not_to_arm(force=force)
         if reasons:
             self._send_reasons("Arm", reasons)
             return False
@@ -326,13 +321,21 @@ class ArduPilotArming(Generic[HostT]):
 
     def on_armed(self) -> None: ...
 
+    def _reasons_not_to_arm(self, *, force: bool) -> list[str]:
+        if not self.vehicle.is_initialised:
+            return ["System not initialised"]
+        if force:
+            return self.mandatory_reasons()
+        return self.reasons() or self.final_reasons()
+
     def disarm(self, *, force: bool = True) -> bool:
         """Stop the motors, even in the air. With ``force=False``, a vehicle in the air stays armed."""
         vehicle = self.vehicle
         if not vehicle.motors.is_armed:
             return True
-        is_in_air = not vehicle.is_landed
-        if not self.needs_arming or (is_in_air and not force):  # ARMING_REQUIRE 0 keeps the vehicle armed for ever.
+        if not self.needs_arming:  # ARMING_REQUIRE 0 keeps the vehicle armed for ever.
+            return False
+        if not vehicle.is_landed and not force:
             return False
         vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)

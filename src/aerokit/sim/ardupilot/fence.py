@@ -48,7 +48,7 @@ class FenceZones:
         return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
 
     def breach_m(self, place: Point, *, union: bool = False) -> float:
-        """Return the metres beyond the border. They are negative inside the allowed area.
+        """Return the distance beyond the border in metres, which is negative inside the allowed area.
 
         With ``union``, the allowed area is the union of the inclusion zones. Otherwise it is their intersection.
         """
@@ -120,8 +120,8 @@ _BACKUP_M = 20.0
 _RECOVERY_DURATION_S = 10.0
 _STATUS_INTERVAL_S = 1.0
 _LOWEST_ALT_MIN_M = -100.0
-_UNION, _NO_MODE_CHANGE = 2, 1
-_WHEN_ARMED = 3
+_UNION, _NO_MODE_CHANGE = 2, 1  # bits of FENCE_OPTIONS
+_WHEN_ARMED = 3  # value of FENCE_AUTOENABLE
 _DEFAULTS = {"FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_AUTOENABLE": 0.0}
 
 REPORT_ONLY = 0
@@ -211,9 +211,10 @@ class ArduPilotFence(Generic[HostT]):
             if not self.present & kinds:
                 return MavResult.FAILED
             self.enable(True, kinds)
-        elif command.param1 in (0.0, 2.0):
-            # The value 2 disables only the lower limit.
-            self.enable(False, kinds if command.param1 == 0.0 else _MIN_ALT)
+        elif command.param1 == 0.0:
+            self.enable(False, kinds)
+        elif command.param1 == 2.0:
+            self.enable(False, _MIN_ALT)
         else:
             return MavResult.FAILED
         return MavResult.ACCEPTED
@@ -265,7 +266,7 @@ class ArduPilotFence(Generic[HostT]):
             if self.active & kind and self._update_breach(kind, beyond_m):
                 new_breaches |= kind
         if not may_be_low:
-            self._enable_floor_above()
+            self._enable_floor_if_above()
         return new_breaches
 
     def _update_breach(self, kind: int, beyond_m: float) -> bool:
@@ -295,7 +296,7 @@ class ArduPilotFence(Generic[HostT]):
             _POLYGON: self.zones.breach_m((north, east), union=union),
         }
 
-    def _enable_floor_above(self) -> None:
+    def _enable_floor_if_above(self) -> None:
         enable, auto_enable = self._enabling_parameters
         enables_floor = self.configured & _MIN_ALT and (enable or auto_enable > 1)
         is_disabled_by_command = self._floor_enabled_by_command is False

@@ -11,7 +11,7 @@ from typing import ClassVar
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.protocols.servers.files import EISDIR, ENOENT, Entry, FileFault, FileTree
-from aerokit.protocols.servers.ftp import FtpPeer, FtpSession, SessionFtpServer
+from aerokit.protocols.servers.ftp import FtpSession, ServedClient, SessionFtpServer
 from aerokit.protocols.servers.ftp_packets import FtpPacket, Refused, path_in
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import SimulatedVehicle
@@ -73,10 +73,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def _work(self) -> None:
         while self._queue and not self._is_bursting:
             request, channel = self._queue.popleft()
-            peer = self._peer(request, channel)
-            assert peer is not None
-            if peer.reply is not None and self._is_repeated(peer, request, peer.reply):
-                self._reply(peer, peer.reply)
+            client = self._client_of(request, channel)
+            assert client is not None
+            if client.reply is not None and self._is_repeated(client, request, client.reply):
+                self._reply(client, client.reply)
             elif request.opcode not in (Op.ACK, Op.NAK):
                 super().receive(request, channel)
         self._is_worker_scheduled = self._is_bursting
@@ -84,27 +84,28 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         return None  # Like the firmware, use a single state for all clients.
 
-    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, reply: FtpPacket) -> bool:
+    def _is_repeated(self, client: ServedClient, request: FtpPacket, reply: FtpPacket) -> bool:
         is_same_session = request.client == reply.client and request.session == reply.session
         return is_same_session and request.sequence + 1 == reply.sequence
 
-    def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
+    def _new_number(self, client: ServedClient, request: FtpPacket) -> int:
         return request.session
 
-    def _watch(self, peer: FtpPeer, session: FtpSession) -> None:
+    def _watch(self, client: ServedClient, session: FtpSession) -> None:
         """Do nothing. The firmware closes an idle session only at a request for another session."""
 
-    def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        # A request for another session closes an idle session. Otherwise, the firmware refuses the request.
+    def _answer(self, client: ServedClient, request: FtpPacket) -> None:
+        # A request for another session closes the open session if it is idle, and is refused otherwise.
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
-        if peer.sessions and request.session not in peer.sessions and not is_close:
+        is_for_other_session = bool(client.sessions) and request.session not in client.sessions
+        if is_for_other_session and not is_close:
             if not self._is_idle():
-                self._reply(peer, request.refuse(MavFtpErr.INVALIDSESSION))
+                self._reply(client, request.refuse(MavFtpErr.INVALIDSESSION))
                 return
-            self._close_all(peer)
-        super()._answer(peer, request)
+            self._close_all(client)
+        super()._answer(client, request)
 
-    def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
+    def _adapted(self, client: ServedClient, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
         is_acknowledged = answer.opcode == Op.ACK
         is_transfer = request.opcode in (Op.READFILE, Op.WRITEFILE) and is_acknowledged
         # Only file transfers and directory listings have an offset. In all other replies, the firmware sends 0.
@@ -113,15 +114,15 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             answer = request.acknowledge()  # an acknowledgement without data
         return answer.replace(offset=offset)
 
-    def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
-        super()._reply(peer, answer)
+    def _reply(self, client: ServedClient, answer: FtpPacket) -> None:
+        super()._reply(client, answer)
         is_session_closed = answer.request_opcode == Op.TERMINATESESSION
         self._sent_at = float("-inf") if is_session_closed else self._host.now
         if self._is_banner_due:
             self._is_banner_due = False
             self._send_banner()
 
-    def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
+    def _answer_fault(self, client: ServedClient, request: FtpPacket, fault: FileFault) -> FtpPacket:
         is_opening = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
         # If a folder is opened as a file, the firmware reports a missing file.
         errno = ENOENT if is_opening and fault.errno == EISDIR else fault.errno
@@ -138,48 +139,48 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
         return path_in(request.data)
 
-    def _session_of(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
-        session = peer.sessions.get(request.session)
+    def _session_of(self, client: ServedClient, request: FtpPacket) -> FtpSession:
+        session = client.sessions.get(request.session)
         if session is None:
             raise Refused(MavFtpErr.FILENOTFOUND)
         if session.is_writing != (request.opcode == Op.WRITEFILE):
             raise Refused(MavFtpErr.FAIL)
         return session
 
-    def _close_all(self, peer: FtpPeer) -> None:
+    def _close_all(self, client: ServedClient) -> None:
         with suppress(FileFault):  # The firmware does not report an error of a close.
-            super()._close_all(peer)
+            super()._close_all(client)
 
-    def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        if request.session in peer.sessions:
-            self._close_all(peer)
+    def _terminate(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        if request.session in client.sessions:
+            self._close_all(client)
         return request.acknowledge()
 
-    def _reset(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        return self._terminate(peer, request)
+    def _reset(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        return self._terminate(client, request)
 
-    def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _open(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         is_reading = request.opcode == Op.OPENFILERO
         is_idle = self._host.now - self._sent_at > _SESSION_TIMEOUT_S
         if is_reading and is_idle:  # The client may have missed the reply to its previous request to open a file.
-            self._close_all(peer)
-        if peer.sessions:
+            self._close_all(client)
+        if client.sessions:
             raise Refused(MavFtpErr.FAIL)
-        answer = super()._open(peer, request)
+        answer = super()._open(client, request)
         # A client that reads the parameter file also gets the banner, as after PARAM_REQUEST_LIST (GCS_FTP.cpp).
         self._is_banner_due = is_reading and self._path(request).startswith("@PARAM/param.pck")
         return answer
 
-    def _read(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        data = self._session_of(peer, request).file.read(request.offset, request.size)
+    def _read(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        data = self._session_of(client, request).file.read(request.offset, request.size)
         return request.acknowledge(data) if data else request.refuse(MavFtpErr.EOF)
 
-    def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> None:
-        session = self._session_of(peer, request)
+    def _start_burst(self, client: ServedClient, request: FtpPacket) -> None:
+        session = self._session_of(client, request)
         self._is_bursting = True
-        self._send_next(peer, session, request, 0)
+        self._send_next(client, session, request, 0)
 
-    def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, block_number: int) -> None:
+    def _send_next(self, client: ServedClient, session: FtpSession, request: FtpPacket, block_number: int) -> None:
         block_size = request.size or DATA_SIZE
         offset = request.offset + block_number * block_size
         sequence = (request.sequence + 1 + block_number) & 0xFFFF
@@ -191,21 +192,21 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             refusal = request.refuse_errno(fault.errno)
         if not data:
             # The firmware sends the refusal with the offset and the flag burst_complete of the previous block.
-            previous = peer.reply if block_number and peer.reply is not None else refusal
+            previous = client.reply if block_number and client.reply is not None else refusal
             end = refusal.replace(sequence=sequence, offset=previous.offset, burst_complete=previous.burst_complete)
-            self._reply(peer, end)
+            self._reply(client, end)
             self._end_burst()
             return
         is_short = len(data) < block_size
         is_last = block_number == _BURST_BLOCKS - 1
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
-        self._reply(peer, block)
+        self._reply(client, block)
         # The firmware reuses one reply for the whole burst (GCS_FTP.cpp). It increments the sequence number after each
         # block, and advances the offset after a short block. The refusal at the end of the burst contains both values.
         next_offset = offset + len(data) if is_short else offset
-        peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
-        next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, block_number + 1)
+        client.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
+        next_step = self._end_burst if is_last else partial(self._send_next, client, session, request, block_number + 1)
         self._host.call_later(self.burst_interval_s, next_step)
 
     def _end_burst(self) -> None:
@@ -216,15 +217,15 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         entries = super()._entries(path)
         if self.files.mounted(path) is not None:
             return entries
-        mounts = [(name, None) for name, mount in self.files.mounts.items() if mount.is_listed]
-        return [(".", None), ("..", None), *entries, *(mounts if path == "/" else [])]
+        mounts = [Entry(name, None) for name, mount in self.files.mounts.items() if mount.is_listed]
+        return [Entry(".", None), Entry("..", None), *entries, *(mounts if path == "/" else [])]
 
     def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
         if self.files.mounted(self._path(request)) is not None:
             raise FileFault(ENOENT)
         return super()._change(request, change)
 
-    def _remove(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _remove(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         return self._change(request, self._remove_either)
 
     def _remove_either(self, path: str) -> None:
@@ -234,10 +235,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         except FileFault:
             self.files.remove_file(path)
 
-    def _truncate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _truncate(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         return self._unknown(request)
 
-    def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+    def _rename(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         old_name, _, remainder = request.data.partition(b"\0")
         new_name, _, _ = remainder.partition(b"\0")
         length = len(old_name) + len(new_name)

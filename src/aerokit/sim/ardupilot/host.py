@@ -57,7 +57,7 @@ class ArduPilotMode:
         self.vehicle = vehicle
 
     def enter(self, *, force: bool) -> bool:
-        """Send the entry texts and start the mode. Return False to refuse it.
+        """Send the entry texts and start the mode. Return False to refuse the mode.
 
         With ``force``, a subclass may accept a mode that cannot run yet. The vehicle forces a mode while it is
         disarmed.
@@ -97,7 +97,7 @@ class ArduPilotMode:
 def variant(
     make_mode: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
 ) -> Callable[[HostT], ArduPilotMode]:
-    """Return a factory for a mode with another number and name. ``traits`` are attributes to set."""
+    """Return a factory that calls ``make_mode`` and sets the number, the name and the attributes in ``traits``."""
 
     def make_variant(host: HostT) -> ArduPilotMode:
         mode = make_mode(host)

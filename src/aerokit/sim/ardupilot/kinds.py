@@ -42,7 +42,7 @@ class BootTimeline:
 
     heartbeat: float = 0.92
     ready: float = 2.36
-    """The vehicle is initialised: streams start and missions are accepted. 0.5 s later, MAV_STATE_BOOT ends."""
+    """The vehicle is initialised: streams start and missions are accepted. MAV_STATE_BOOT ends about 0.5 s later."""
     estimator_active: float = 4.36
     tilt_aligned: float = 5.70
     yaw_aligned: float = 5.80

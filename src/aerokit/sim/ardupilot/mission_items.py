@@ -38,7 +38,7 @@ class StoredCommand(NamedTuple):
     name: str
     """Name of the command in status texts; empty if a mission cannot contain the command."""
     parameters: str
-    """Storage types (see `_CONVERSIONS`) of params 1 to 4, and of x, y and z if they are no position.
+    """Storage types (see `_CONVERSIONS`) of params 1 to 4, and of x, y and z if they are not a position.
 
     Empty for an unsupported command.
     """
@@ -90,7 +90,7 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the downloaded MAV_FRAME of an item that was uploaded with ``frame``, or None if it is refused."""
+    """Return the downloaded MAV_FRAME of an item that was uploaded with ``frame``. None if the frame is refused."""
     return _DOWNLOADED_FRAMES.get(frame)
 
 

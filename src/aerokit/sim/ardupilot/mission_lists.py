@@ -22,7 +22,7 @@ _HOME_SEQ = 0
 
 
 class ItemList:
-    """Base of the lists of mission, fence and rally items. Integer results are MAV_MISSION_RESULTs."""
+    """Base of the lists of mission, fence and rally items. `put` and `finish` return a MAV_MISSION_RESULT."""
 
     name: ClassVar[str]
     """Name of the list in status texts."""
@@ -112,8 +112,8 @@ class CommandList(ItemList):
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
-        # A list with space only for home refuses every item, even item 0 (home), which is not stored.
-        has_space = self.capacity > 1 and seq < self.capacity
+        has_space_beyond_home = self.capacity > 1  # Without it, even the upload of home (item 0) is refused.
+        has_space = has_space_beyond_home and seq < self.capacity
         if seq > count or not has_space:
             return MavMissionResult.ERROR
         if seq == count:

@@ -24,8 +24,9 @@ _UNLIMITED = -1
 _WITH_TARGET = frozenset({Cmd.DO_JUMP, Cmd.JUMP_TAG, Cmd.DO_JUMP_TAG})
 _TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
 _BEFORE_TAKE_OFF = frozenset({Cmd.DO_AUX_FUNCTION, Cmd.NAV_DELAY})
-_NAVIGATION_BEYOND = frozenset({Cmd.NAV_SET_YAW_SPEED, Cmd.NAV_SCRIPT_TIME, Cmd.NAV_ATTITUDE_TIME})
-# Commands that are complete as soon as they have started, on every vehicle, without a status text.
+# Navigation commands with a number above NAV_LAST.
+_NAVIGATION_ABOVE_LAST = frozenset({Cmd.NAV_SET_YAW_SPEED, Cmd.NAV_SCRIPT_TIME, Cmd.NAV_ATTITUDE_TIME})
+# Commands that every vehicle supports, and that are complete as soon as they have started.
 _INSTANT = frozenset(
     {
         Cmd.DO_GRIPPER, Cmd.DO_SET_SERVO, Cmd.DO_SET_RELAY, Cmd.DO_REPEAT_SERVO, Cmd.DO_REPEAT_RELAY,
@@ -61,7 +62,7 @@ class MissionMode(ArduPilotMode):
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
     def on_disarmed(self) -> None:
-        # Disarming has reset the progress, so `update` starts the first command again. The disarmed vehicle waits.
+        # Disarming has reset the progress. `update` starts the first command, which waits until the vehicle is armed.
         if self.vehicle.mode is self:
             self.vehicle.mission.update()
 
@@ -104,7 +105,7 @@ class MissionMode(ArduPilotMode):
 
 
 def is_navigation(item: MissionItem) -> bool:
-    return item.command <= Cmd.NAV_LAST or item.command in _NAVIGATION_BEYOND
+    return item.command <= Cmd.NAV_LAST or item.command in _NAVIGATION_ABOVE_LAST
 
 
 class MissionRun:
@@ -238,7 +239,10 @@ class MissionRun:
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Let a stopped mission resume at the next navigation command. Return False if there is none."""
+        """Let a stopped mission resume at the first navigation command from ``index`` on.
+
+        Return False if there is no such command.
+        """
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:

@@ -260,10 +260,10 @@ _BEND_TOLERANCE, _LOOP_TOLERANCE = 0.5, 0.99
 
 
 class SmartPath:
-    """Recorded path of SMART_RTL: at most SRTL_POINTS points, SRTL_ACCURACY metres apart.
+    """Recorded path of SMART_RTL: at most SRTL_POINTS points, at least SRTL_ACCURACY metres apart.
 
-    The path starts where the vehicle was armed or first had a position. After 15 s without a position, or without
-    space for another point, the path is deactivated and SMART_RTL is refused.
+    The path starts where the vehicle was armed or first had a position. If the position, or the space for another
+    point, is missing for 15 s, the path is deactivated and SMART_RTL is refused.
     """
 
     def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:

@@ -186,10 +186,11 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         has_no_place = (item.x, item.y) == (0, 0)
         if has_no_place:
             north, east = own_north, own_east
-        # Loitering at the altitude 0 in a relative frame keeps the plane's altitude (Location.cpp, sanitize). Other
-        # commands keep it if both altitude and coordinates are 0 (commands.cpp, set_next_WP).
-        may_omit_altitude = item.frame not in _ABSOLUTE if manoeuvre == _LOITER else has_no_place
-        if item.z == 0 and may_omit_altitude:
+        if manoeuvre == _LOITER:  # An altitude of 0 in a relative frame means the present altitude (Location.cpp).
+            keeps_altitude = item.z == 0 and item.frame not in _ABSOLUTE
+        else:  # With zero coordinates, an altitude of 0 means the present altitude (commands.cpp, set_next_WP).
+            keeps_altitude = item.z == 0 and has_no_place
+        if keeps_altitude:
             down = own_down
         self._place = (north, east, down)
         self._manoeuvre = manoeuvre

@@ -26,7 +26,7 @@ _PILOTED = frozenset(
     | {PlaneMode.FLY_BY_WIRE_B, PlaneMode.CRUISE, PlaneMode.TRAINING}
 )
 _NAVIGATING = frozenset({PlaneMode.AUTO, PlaneMode.GUIDED, PlaneMode.LOITER, PlaneMode.AUTOLAND})
-_LONG_AS_PILOTED = _PILOTED | {PlaneMode.CIRCLE, PlaneMode.LOITER, PlaneMode.TAKEOFF}
+_PILOTED_FOR_LONG_FAILSAFE = _PILOTED | {PlaneMode.CIRCLE, PlaneMode.LOITER, PlaneMode.TAKEOFF}
 _SHORT_MODES = {_SHORT_FBWA: PlaneMode.FLY_BY_WIRE_A, _SHORT_FBWB: PlaneMode.FLY_BY_WIRE_B}
 _LONG_MODES: dict[int, tuple[int, ...]] = {
     _LONG_GLIDE: (PlaneMode.FLY_BY_WIRE_A,),
@@ -170,7 +170,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.state = state
         mode = plane.mode.number
         action = int(plane.parameters["FS_LONG_ACTN"])
-        if mode in _LONG_AS_PILOTED:
+        if mode in _PILOTED_FOR_LONG_FAILSAFE:
             acts_in_take_off = action in (_LONG_GLIDE, _LONG_PARACHUTE)
             if self._is_in_take_off and not acts_in_take_off:
                 self._is_long_pending = True  # `FS_LONG_ACTN` is executed after the initial climb.

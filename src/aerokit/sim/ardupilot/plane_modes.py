@@ -67,7 +67,7 @@ class PlaneHost(ArduPilotVehicle):
         """Fly in the take-off direction at cruise speed, and climb as soon as the airspeed suffices."""
         wing = self.wing
         self.lift_off()
-        if wing.is_on_ground:  # Roll straight ahead. The motion model climbs as soon as the airspeed suffices.
+        if wing.is_on_ground:  # Roll straight ahead.
             wing.bank_and_climb(self.cruise_m_s, 0.0, wing.wing_limits.climb_m_s)
         else:
             yaw = wing.yaw if self.take_off_yaw is None else self.take_off_yaw
@@ -119,7 +119,7 @@ class PlaneLanding:
     def _approach(self) -> None:
         plane, wing = self._plane, self._plane.wing
         north, east, down = self.point
-        start_north, start_east, start_down = self._approach_start
+        start_north, start_east, _ = self._approach_start
         course = math.atan2(east - start_east, north - start_north)
         cos_course, sin_course = math.cos(course), math.sin(course)
         # Metres to the landing point along the approach line; negative once the plane has passed the point.
@@ -129,23 +129,26 @@ class PlaneLanding:
         # The flare starts below LAND_FLARE_ALT, or when the plane would touch down within LAND_FLARE_SEC.
         height, sink_rate = down - wing.down, wing.velocity_down
         flare_height = max(plane.parameters["LAND_FLARE_ALT"], sink_rate * plane.parameters["LAND_FLARE_SEC"])
-        if height < flare_height:
-            self._flare(height, remaining)
+        if height < flare_height and not self._is_flaring:
+            self._start_flare(height, remaining)
         if self._is_flaring:
-            climb = -_FLARE_SINK_M_S
-            speed = wing.wing_limits.airspeed_min_m_s
+            speed, climb = wing.wing_limits.airspeed_min_m_s, -_FLARE_SINK_M_S
         else:
-            length = max(1.0, math.hypot(north - start_north, east - start_east))
-            down_on_slope = down + (start_down - down) * max(0.0, remaining) / length
-            slope_sink = (down - start_down) * wing.ground_speed_m_s / length
-            climb = -slope_sink + wing.climb_rate_to(down_on_slope)
-            speed = _APPROACH_SHARE * plane.cruise_m_s
-        # The course points to the approach line, more directly the farther the plane is from it.
+            speed, climb = _APPROACH_SHARE * plane.cruise_m_s, self._climb_on_slope(max(0.0, remaining))
+        # The farther the plane is from the approach line, the more directly its course points to the line.
         wing.head(course + math.atan2(aside, _CORRECTION_LENGTH_M), speed, climb)
 
-    def _flare(self, height: float, remaining: float) -> None:
-        if self._is_flaring:
-            return
+    def _climb_on_slope(self, remaining: float) -> float:
+        """Return the climb rate on the straight slope to the landing point, ``remaining`` metres from the point."""
+        wing = self._plane.wing
+        north, east, down = self.point
+        start_north, start_east, start_down = self._approach_start
+        length = max(1.0, math.hypot(north - start_north, east - start_east))
+        down_on_slope = down + (start_down - down) * remaining / length
+        slope_sink = (down - start_down) * wing.ground_speed_m_s / length
+        return -slope_sink + wing.climb_rate_to(down_on_slope)
+
+    def _start_flare(self, height: float, remaining: float) -> None:
         self._is_flaring = True
         wing = self._plane.wing
         speed, sink = wing.ground_speed_m_s, wing.velocity_down

@@ -104,11 +104,10 @@ class ArduPilotRadio:
         for index in range(_OVERRIDABLE):
             value = getattr(override, f"chan{index + 1}_raw")
             is_upper = index >= len(self._sticks)  # one of the channels 9 to 16
-            if value == _UNCHANGED or (value == 0 and is_upper):  # For channels above 8, 0 means unchanged, too.
-                continue
-            if value == _RELEASE_UPPER and is_upper:
-                value = 0
-            self._overrides[index] = (value, vehicle.now)
+            is_unchanged = value == _UNCHANGED or (is_upper and value == 0)
+            is_release = value == _RELEASE_UPPER if is_upper else value == 0
+            if not is_unchanged:
+                self._overrides[index] = (0 if is_release else value, vehicle.now)
 
 
 _NO_VALUE = 0x7FFF

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavDataStream as Stream
@@ -49,6 +50,13 @@ DISPLAY_VALUES: dict[str, float] = {
 """Names and values of NAMED_VALUE_FLOAT, which ArduSub sends one after the other with EXTENDED_STATUS."""
 
 
+class _ChangedRate(NamedTuple):
+    """A rate parameter that REQUEST_DATA_STREAM has changed until the next reboot."""
+
+    value_after_reboot: float
+    requested: int
+
+
 class ArduPilotMessageRequests:
     """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM.
 
@@ -63,8 +71,7 @@ class ArduPilotMessageRequests:
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # Rate parameters that REQUEST_DATA_STREAM has changed: (value after a reboot, requested value) by name.
-        self._changed_rates: dict[str, tuple[float, int]] = {}
+        self._changed_rates: dict[str, _ChangedRate] = {}  # by parameter name
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)
 
@@ -160,22 +167,23 @@ class ArduPilotMessageRequests:
     def restart(self) -> None:
         """Restore the stream rates that REQUEST_DATA_STREAM has changed."""
         parameters = self._vehicle.parameters
-        for name, (value_after_reboot, requested) in self._changed_rates.items():
-            if parameters[name] == requested:  # False if PARAM_SET has set another value, which is kept.
-                parameters[name] = value_after_reboot
+        for name, change in self._changed_rates.items():
+            if parameters[name] == change.requested:  # False if PARAM_SET has set another value, which is kept.
+                parameters[name] = change.value_after_reboot
         self._changed_rates.clear()
 
     def _store_rate(self, name: str, rate: int) -> None:
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
-        # A second change keeps the value from before the first change.
-        value_after_reboot, _ = self._changed_rates.get(name, (parameters[name], rate))
+        previous_value, previous_change = parameters[name], self._changed_rates.get(name)
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
             vehicle.announce_parameter(name)
+        elif previous_change is None:
+            self._changed_rates[name] = _ChangedRate(value_after_reboot=previous_value, requested=rate)
         else:
-            self._changed_rates[name] = (value_after_reboot, rate)
+            self._changed_rates[name] = previous_change._replace(requested=rate)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
         """Stream a group at ``rate`` Hz from the time ``first`` on. 0 stops it."""
@@ -184,8 +192,8 @@ class ArduPilotMessageRequests:
             interval = group_interval
             if message_id == m.TerrainRequest.ID and rate > 0:
                 interval = max(interval, _MIN_TERRAIN_REQUEST_INTERVAL_S)
-            # Each message contains the next one of `DISPLAY_VALUES`. The rate of the group is that of each value.
             elif message_id == m.NamedValueFloat.ID:
+                # A message contains one of `DISPLAY_VALUES`, in turn. Each value is sent at the rate of the group.
                 interval /= len(DISPLAY_VALUES)
             self._stream(message_id, interval, channel, first)
 

@@ -105,7 +105,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A low battery is not included, because it does not cause MAV_STATE_CRITICAL on Rover.
+        # On Rover, a low battery does not cause MAV_STATE_CRITICAL.
         return bool(self._triggered) or self.has_estimator_failed
 
     def update(self) -> None:
@@ -147,7 +147,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
-        # `name` is the link that was just checked, which is not always the lost one (failsafe.cpp, failsafe_trigger).
+        # Like the firmware, name the link that was just checked, even if only the other link is lost (failsafe.cpp,
+        # failsafe_trigger).
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
         rover.rc.release_overrides()
@@ -179,7 +180,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
                 self.has_estimator_failed = False
                 self.warn("EKF failsafe cleared", MavSeverity.CRITICAL)
             return
-        if self.has_estimator_failed or lost_for < _ESTIMATOR_TIMEOUT_S:  # Act once, after the timeout.
+        can_start = lost_for >= _ESTIMATOR_TIMEOUT_S and not self.has_estimator_failed
+        if not can_start:
             return
         self.has_estimator_failed: bool = True
         self.warn("EKF variance", MavSeverity.CRITICAL)
@@ -208,7 +210,7 @@ _HOLD_BEYOND_M = 100.0
 class RoverFence(ArduPilotFence[RoverHost]):
     """ArduRover's fence, which has no altitude limits and sends no texts.
 
-    FENCE_ACTION has the values of FS_ACTION. If it is not 0, a rover more than 100 m outside the fence changes to HOLD.
+    FENCE_ACTION has the values of FS_ACTION. With any action but 0, a rover more than 100 m outside changes to HOLD.
     """
 
     PERIOD_S: ClassVar[float] = 0.1

@@ -104,12 +104,15 @@ _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """Message signing of ArduPilot. The time stamp is stored every 30 s. A boot adds a minute to it.
+    """Message signing of ArduPilot, which sends no status text about a new key.
+
+    The time stamp is stored every 30 s. When a port begins to sign, its time stamp is the stored one plus a minute.
 
     The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. If the
-    only link of the vehicle is a radio, set ``trusts_first_port`` to False and call `load`. Bit 0 of MAV1_OPTIONS,
-    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING. ArduPilot sends no
-    status text about a new key.
+    only link of the vehicle is a radio, set ``trusts_first_port`` to False and call `load`.
+
+    Bit 0 of MAV1_OPTIONS turns signing off on the first port, and bit 0 of MAV2_OPTIONS on the second. A change of the
+    bit takes effect at the next boot or SETUP_SIGNING.
     """
 
     AHEAD: ClassVar[int] = ONE_MINUTE

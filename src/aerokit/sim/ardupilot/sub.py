@@ -64,7 +64,7 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 
 
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
-    """ArduSub's failsafes. Most of them act only while armed. Not simulated: terrain, estimator, crash."""
+    """ArduSub's failsafes, except those of terrain, estimator and crash. Most of them act only while armed."""
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 
@@ -79,7 +79,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A lost radio is not included, because on Sub it alone does not cause MAV_STATE_CRITICAL.
+        # On Sub, a lost radio does not cause MAV_STATE_CRITICAL.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
         return self.is_pilot_lost or self.battery_is_low or self.is_ground_station_lost or self.is_leak_detected or hull
 
@@ -259,7 +259,7 @@ class SimulatedSub(SubHost):
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
-        """Create the motion model. A SIM_BUOYANCY of 1 accelerates upwards by 0.1 m/s². Wind has no effect."""
+        """Create the motion model. Each unit of SIM_BUOYANCY accelerates upwards by 0.1 m/s². Wind has no effect."""
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
 
     def listen_for_setpoints(self) -> None:

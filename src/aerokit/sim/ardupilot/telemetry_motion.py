@@ -159,11 +159,10 @@ _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which th
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     motion, nav = vehicle.motion, vehicle.navigation
     time = vehicle.time_boot_ms
-    # As in the firmware, latitude and longitude are 0 before the first position.
-    place = nav.position  # None until the estimator knows the position
+    place = nav.position
     relative = round(nav.altitude_above_home * 1000)
     heading = centidegrees(motion.yaw) if nav.has_attitude else 0
-    if place is None:
+    if place is None:  # As in the firmware, latitude and longitude are 0 before the first position.
         return m.GlobalPositionInt(
             time_boot_ms=time, lat=0, lon=0, alt=0, relative_alt=relative, vx=0, vy=0, vz=0, hdg=heading
         )

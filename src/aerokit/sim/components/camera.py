@@ -60,11 +60,13 @@ def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgre
     if captures.is_busy or captures.is_recording:
         return MavResult.TEMPORARILY_REJECTED
 
+    formats_card, resets_image_log = command.param2 == 1.0, command.param3 == 1.0
+
     def finish() -> None:
-        if command.param2 == 1.0:
+        if formats_card:
             camera.card.format()
             camera.clear_files()
-        if command.param3 == 1.0:
+        if resets_image_log:
             captures.clear()
 
     return CommandProgress(_FORMAT_PERCENTS, _FORMAT_INTERVAL_S, finish=finish)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,7 +11,7 @@ from aerokit.mavlink.messages import CameraImageCaptured, CameraTrackingGeoStatu
 from aerokit.parameters import parse_definition
 from aerokit.parameters.definition import CameraDefinition
 from aerokit.protocols.servers.camera import camera_builders
-from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice, Shot
+from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice
 from aerokit.protocols.servers.files import FileTree
 from aerokit.protocols.servers.host import ServerHost
 from aerokit.protocols.servers.intervals import Builder
@@ -184,16 +183,14 @@ class CameraBody(SimulatedComponent, CameraDevice):
         for name, _ in self.files.entries("/DCIM"):
             self.files.remove_file(f"/DCIM/{name}")
 
-    def expose(self, done: Callable[[Shot | None], None]) -> None:
-        shot = self._shoot()
-        self.call_later(self.shutter_s, lambda: done(shot))
+    def expose(self, done: Callable[[CameraImageCaptured | None], None]) -> None:
+        image = self._new_image()
+        self.call_later(self.shutter_s, lambda: done(image))
 
-    def _shoot(self) -> Shot:
-        """Return a function that makes CAMERA_IMAGE_CAPTURED with the present time, position and attitude."""
+    def _new_image(self) -> CameraImageCaptured:
         pose, angles = pose_of(self.vehicle), self.angles()
         place = None if pose is None else pose.place
-        return partial(
-            CameraImageCaptured,
+        return CameraImageCaptured(
             time_boot_ms=self.time_boot_ms,
             time_utc=round(getattr(self.vehicle, "unix_time", 0.0) * 1e6),
             camera_id=0,  # A camera that is a separate component has the id 0.
@@ -202,6 +199,8 @@ class CameraBody(SimulatedComponent, CameraDevice):
             alt=0 if place is None else round(place.altitude_m * 1000),
             relative_alt=0 if pose is None else round(pose.height_m * 1000),
             q=UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles),
+            image_index=0,
+            capture_result=0,
             file_url="",
         )
 

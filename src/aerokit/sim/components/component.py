@@ -40,7 +40,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
     except InvalidArgument:
         return None
     motion = vehicle.motion  # type: ignore[attr-defined]
-    # Only models of autopilots have a home, and `altitude_m` above it. For the others, the origin is the home.
+    # Only simulated autopilots have `altitude_m`, the height above home. For other vehicles, the origin is the home.
     height_m = getattr(vehicle, "altitude_m", -motion.down)
     return Pose(place, height_m, motion.roll, motion.pitch, motion.yaw)
 

@@ -20,7 +20,7 @@ from aerokit.protocols.servers.gimbal import (
     gimbal_commands,
     listen_for_gimbal,
 )
-from aerokit.protocols.servers.host import ServerHost
+from aerokit.protocols.servers.host import ComponentIds, ServerHost
 from aerokit.protocols.servers.intervals import Builder
 from aerokit.sim.components.component import SimulatedComponent, pose_of
 from aerokit.sim.motion import GlobalPoint
@@ -68,8 +68,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self._reset()
 
     def _reset(self) -> None:
-        self.primary: tuple[int, int] = (0, 0)
-        self.secondary: tuple[int, int] = (0, 0)
+        self.primary = self.secondary = ComponentIds()
         self.flags: int = 0
         self.region: GlobalPoint | None = None
         """Position to point at; None without a region of interest."""

@@ -61,8 +61,8 @@ class Px4Calibration:
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
-            # A request without a sensor cancels the calibration. Others are refused (calibration_routines.cpp,
-            # calibrate_cancel_check).
+            # A request without a sensor cancels the calibration. A request with a sensor is refused
+            # (calibration_routines.cpp, calibrate_cancel_check).
             if sensor:
                 self._px4.send_text(MavSeverity.CRITICAL, f"command denied during calibration: {command.command}")
                 return MavResult.TEMPORARILY_REJECTED

@@ -101,7 +101,7 @@ class Px4Vehicle(Px4Host):
         self.events = Px4Events(self)
         self._next_text_id = 0
         self._pings = 0  # number of PINGs sent
-        self.home: Ned = (0.0, 0.0, 0.0)  # In the local frame, whose origin is the argument `home`.
+        self.home: Ned = (0.0, 0.0, 0.0)  # In the local frame, whose zero point is the argument `home`.
         self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points, which survive a reboot."""
         self.camera_trigger: Px4CameraTrigger = Px4CameraTrigger(self)

@@ -133,7 +133,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.MISSION_START: flight.start_mission,
         Cmd.DO_SET_HOME: flight.set_home,
         Cmd.EXTERNAL_WIND_ESTIMATE: px4.external.set_wind,
-        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),  # A reboot replaces the object.
+        Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),  # A reboot replaces `calibration`.
         Cmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         Cmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
     }

@@ -63,30 +63,30 @@ class Px4LogStream:
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4
-        # (system id, component id) of the client; None while no log is streamed.
-        self._station: tuple[int, int] | None = None
+        # System id and component id of the client; None while no log is streamed.
+        self._client: tuple[int, int] | None = None
         self._channel: Channel | None = None
-        self._stream_number = 0  # number of this stream; scheduled calls of `_run` for an earlier number do nothing
+        self._stream_number = 0  # number of this stream; a scheduled `_send_block` of an earlier stream does nothing
         self._sequence = 0  # number of the next block
         self._tries = 0  # how often this block was sent
         self._acknowledged = 0  # number of definition blocks that were acknowledged
         px4.on(m.LoggingAck, self._on_ack)
 
     def start(self, command: ReceivedCommand) -> int:
-        if self._station is not None:
+        if self._client is not None:
             return MavResult.TEMPORARILY_REJECTED
         log_format = command.param1
         if log_format:  # PX4 supports only ULog (0).
             return MavResult.UNSUPPORTED
-        self._station = command.sender
+        self._client = command.sender
         self._channel = command.channel
         self._sequence = self._tries = self._acknowledged = 0
         self._stream_number += 1
-        self._run_later(self._stream_number)
+        self._schedule_block(self._stream_number)
         return MavResult.ACCEPTED
 
     def stop(self, _: ReceivedCommand) -> int:
-        self._station = None
+        self._client = None
         return MavResult.ACCEPTED
 
     def _on_ack(self, ack: m.LoggingAck, _: Channel) -> None:
@@ -99,15 +99,15 @@ class Px4LogStream:
     def _sends_definitions(self) -> bool:
         return self._acknowledged < _DEFINITION_BLOCKS
 
-    def _run_later(self, stream: int) -> None:
-        self._px4.call_later(_BLOCK_INTERVAL_S, lambda: self._run(stream))
+    def _schedule_block(self, stream: int) -> None:
+        self._px4.call_later(_BLOCK_INTERVAL_S, lambda: self._send_block(stream))
 
-    def _run(self, stream: int) -> None:
-        if self._station is None or stream != self._stream_number:
+    def _send_block(self, stream: int) -> None:
+        if self._client is None or stream != self._stream_number:
             return
         self._tries += 1
         if self._tries > _MAX_TRIES and self._sends_definitions:
-            self._station = None
+            self._client = None
             return
         # Each block contains two text messages, and the first block begins with the header of the file.
         message_class = m.LoggingDataAcked if self._sends_definitions else m.LoggingData
@@ -116,11 +116,11 @@ class Px4LogStream:
         sequence = self._sequence & 0xFFFF
         first_message_offset = len(header)
         padded = data.ljust(_LOGGING_BYTES, b"\0")
-        block = message_class(*self._station, sequence, len(data), first_message_offset, padded)
+        block = message_class(*self._client, sequence, len(data), first_message_offset, padded)
         self._px4.send(block, self._channel)
         if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.
             self._sequence += 1
-        self._run_later(stream)
+        self._schedule_block(stream)
 
 
 def _ulog_message(number: int) -> bytes:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
+from typing import NamedTuple
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavBatteryChargeState, MavMissionType, MavSeverity, MavType
@@ -22,10 +23,18 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, MODES, OFFBOARD, ORBIT, RTL, Px4Mode
 
+# Commands of the areas: True for an inclusion area, False for an exclusion area.
 _POLYGONS = {Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
 _CIRCLES = {Cmd.NAV_FENCE_CIRCLE_INCLUSION: True, Cmd.NAV_FENCE_CIRCLE_EXCLUSION: False}
 _NO_ACTION, _WARNING = 0, 1
 _BATTERY_LAND, _BATTERY_RETURN = 2, 3
+
+
+class _Area(NamedTuple):
+    """An area of the geofence, and whether it contains the point in question."""
+
+    is_inclusion: bool
+    contains_point: bool
 
 
 class Px4Fence:
@@ -79,27 +88,25 @@ class Px4Fence:
 
     def _areas_allow(self, north: float, east: float) -> bool:
         areas = list(self._areas(north, east))
-        is_inside_inclusions = [is_inside for is_inclusion, is_inside in areas if is_inclusion]
-        is_inside_exclusions = [is_inside for is_inclusion, is_inside in areas if not is_inclusion]
-        if any(is_inside_exclusions):
+        if any(area.contains_point for area in areas if not area.is_inclusion):
             return False
-        return not is_inside_inclusions or any(is_inside_inclusions)
+        inclusions = [area for area in areas if area.is_inclusion]
+        return not inclusions or any(area.contains_point for area in inclusions)
 
-    def _areas(self, north: float, east: float) -> Iterator[tuple[bool, bool]]:
-        """Yield (is an inclusion area, contains the point) for each area."""
+    def _areas(self, north: float, east: float) -> Iterator[_Area]:
         items, index = self._items(), 0
         while index < len(items):
             item = items[index]
             if item.command in _POLYGONS:
-                count = max(1, int(item.param1))  # The number of corners, which every corner contains.
+                count = max(1, int(item.param1))  # Param 1 of each corner is the number of corners.
                 corners = [self._place(corner) for corner in items[index : index + count]]
-                yield _POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east)
+                yield _Area(_POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east))
                 index += count
                 continue
             if item.command in _CIRCLES:
                 center = self._place(item)
-                inside = math.dist(center, (north, east)) <= item.param1
-                yield _CIRCLES[Cmd(item.command)], inside
+                is_in_circle = math.dist(center, (north, east)) <= item.param1
+                yield _Area(_CIRCLES[Cmd(item.command)], is_in_circle)
             index += 1
 
     def _items(self) -> Sequence[MissionItem]:
@@ -143,7 +150,7 @@ Action = FailsafeAction
 _LINK_ACTIONS = {1: Action.HOLD, 2: Action.RETURN, 3: Action.LAND, 5: Action.TERMINATE, 6: Action.DISARM}
 _FENCE_ACTIONS = {1: Action.WARN, 2: Action.HOLD, 3: Action.RETURN, 4: Action.TERMINATE, 5: Action.LAND}
 _MODES: dict[FailsafeAction, Px4Mode] = {Action.HOLD: HOLD, Action.RETURN: RTL, Action.LAND: LAND}
-# After this time without a position, PX4 1.17 (SIH, satellites switched off) ends a mode that needs a position.
+# After this time without a position, PX4 leaves a mode that needs a position (measured with PX4 1.17, SIH).
 _POSITION_TIMEOUT_S = 5.0
 _BATTERY_TEXTS = {
     MavBatteryChargeState.LOW: (MavSeverity.CRITICAL, "Low battery"),
@@ -222,9 +229,9 @@ class Px4Failsafes:
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
-        is_known_at_arming = state <= self._battery_at_arming  # The pilot armed in this state, so only warn.
+        is_unchanged_since_arming = state <= self._battery_at_arming  # PX4 then only warns.
         has_action = action in (_BATTERY_LAND, _BATTERY_RETURN)
-        if state == MavBatteryChargeState.LOW or is_known_at_arming or not has_action:
+        if state == MavBatteryChargeState.LOW or is_unchanged_since_arming or not has_action:
             return Action.WARN
         must_land = action == _BATTERY_LAND or state == MavBatteryChargeState.EMERGENCY
         return Action.LAND if must_land else Action.RETURN

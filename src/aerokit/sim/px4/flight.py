@@ -76,7 +76,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return the destination of RTL. The heights of RTL are relative to its down coordinate."""
+    """Return the destination of RTL. The heights in parameters of RTL are relative to the destination."""
     rtl_type = round(px4.parameters["RTL_TYPE"])
     rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
@@ -89,8 +89,8 @@ def return_destination(px4: Px4Host) -> Ned:
 def _place(px4: Px4Host, item: MissionItem) -> Ned:
     north, east = px4.frame.to_local(round(item.x), round(item.y))
     _, _, home_down = px4.home
-    reference = home_down if item.frame in _RELATIVE else px4.frame.origin.altitude_m
-    return (north, east, reference - item.z)
+    down_at_zero_altitude = home_down if item.frame in _RELATIVE else px4.frame.origin.altitude_m
+    return (north, east, down_at_zero_altitude - item.z)
 
 
 _SPOOL_UP_S = 1.8
@@ -272,5 +272,9 @@ class Px4Flight:
 
 
 def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
-    """Return the speed along one axis towards a point ``offset`` metres away. It has the sign of ``offset``."""
-    return math.copysign(min(limit, approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)), offset)
+    """Return the velocity in m/s along one axis that lets a vehicle stop at a point ``offset`` metres away.
+
+    The velocity is at most ``limit``. ``acceleration`` (m/s²) limits the braking.
+    """
+    speed = approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)
+    return math.copysign(min(limit, speed), offset)

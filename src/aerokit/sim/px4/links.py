@@ -38,7 +38,7 @@ _RETURN_TEXT = re.compile(r"RTL: start return at (-?\d+) m \((-?\d+) m above des
 
 
 class Px4Events:
-    """Sends events. Their sequence number soon overflows, so that tests of clients cover the overflow."""
+    """Sends events. The sequence number starts just below its limit, so that tests of clients cover the overflow."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -107,7 +107,7 @@ class Px4TextLinks:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.speedup: float = 1.0
-        """Simulated seconds per second of the clients' clocks. Timeouts are multiplied by it."""
+        """Simulated seconds per second of the clients' clocks. The timeouts are multiplied by this number."""
         self._station_at: dict[Channel, float] = {}  # time of the last heartbeat of a ground station on each link
         # Queued texts of each link without a ground station, as (time, chunks).
         self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}

@@ -101,7 +101,7 @@ _HOLDS_PLACE = frozenset({POSITION, POSITION_SLOW})
 
 
 class Px4ManualFlight:
-    """Converts stick positions to motion targets. In manual modes, `update` is called at 50 Hz."""
+    """Converts stick positions to motion targets. In manual modes, `update` is called at every tick."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4

@@ -137,14 +137,14 @@ class Px4Mission:
         self.current: int = 0  # Index of the item that is flown now or next.
         self.reached: int = -1  # Index of the item that was reached last; -1 if there is none.
         self.is_finished: bool = False  # True after the last item was completed.
-        self._needs_selection = False  # True from the end of the mission until an item is selected.
+        self._needs_selection = False  # True from the end of the mission until a client selects an item.
         self.is_valid: bool = False  # True if there is a mission and it can be flown.
         self._phase = ""  # Phase of the current item: "climb", "go" or "land".
         self._arrived_at = math.nan  # time of arrival at the current item; NaN before
         self._jumps: dict[int, int] = {}  # Number of jumps that each DO_JUMP has done, by its index.
         self._state = int(MissionState.NO_MISSION)  # a MISSION_STATE
         self._repeats_left = 0  # how often MISSION_ITEM_REACHED is still repeated
-        self._is_report_scheduled = False  # True while a repetition is due
+        self._is_report_scheduled = False  # True while `_send_reached` is scheduled
 
     def start(self) -> None:
         self.is_valid = bool(self.count) and rejection(self._px4, self._px4.missions.commands) is None
@@ -224,8 +224,8 @@ class Px4Mission:
     def enter(self) -> None:
         if not self.is_valid:
             return
-        # In the air, PX4 flies a finished mission again only after an item was selected. On the ground it starts again
-        # (mission_base.cpp, checkMissionRestart).
+        # In the air, PX4 flies a finished mission again only after a client has selected an item (mission_base.cpp,
+        # checkMissionRestart).
         if self._needs_selection and self._px4.is_armed and not self._px4.is_landed:
             self._px4.send_text(MavSeverity.CRITICAL, "No valid mission available, loitering")
             self._px4.call_later(0.0, self._hold)
@@ -240,7 +240,7 @@ class Px4Mission:
         self._begin_item()
 
     def _begin_item(self) -> None:
-        """Execute commands up to the next item with a position, and make it the target."""
+        """Execute commands up to the next item with a position, and make that item the target."""
         for _ in range(_MAX_JUMPS + self.count):  # The number of steps is limited, because DO_JUMPs can form a loop.
             item = self._item
             self._arrived_at = math.nan
@@ -323,7 +323,8 @@ class Px4Mission:
             return (north, east, motion.down)
         _, _, home_down = px4.home
         is_relative = item.frame == MavFrame.GLOBAL_RELATIVE_ALT
-        return (north, east, (home_down if is_relative else px4.frame.origin.altitude_m) - item.z)
+        down_at_zero_altitude = home_down if is_relative else px4.frame.origin.altitude_m
+        return (north, east, down_at_zero_altitude - item.z)
 
     def update(self) -> None:
         item, flight = self._item, self._px4.flight

@@ -15,6 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType, MavSeverity
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
+from aerokit.protocols.servers.host import ComponentIds
 from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
@@ -30,7 +31,7 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.mission_items import as_downloaded, as_stored, checksum
 from aerokit.sim.vehicle import sender_of
 
-_NO_PARTNER = (0, 0)
+_NO_PARTNER = ComponentIds()
 _CAPACITIES: dict[int, int] = {MavMissionType.MISSION: 10_000, MavMissionType.FENCE: 64, MavMissionType.RALLY: 32}
 
 
@@ -42,7 +43,7 @@ class TransferState(Enum):
 
 @dataclass(eq=False)
 class _Link(ListUpload):
-    """State of the latest mission transfer on a link. PX4 still uses it after the transfer has ended."""
+    """State of the latest mission transfer on a link. PX4 uses this state even after the transfer has ended."""
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0  # checksum of the items received so far
@@ -127,7 +128,7 @@ class Px4MissionServer(MissionServer):
     def _warn(self, text: str) -> None:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
-    def _answer(self, link: _Link, result: int, to: tuple[int, int] | None = None) -> None:
+    def _answer(self, link: _Link, result: int, to: ComponentIds | None = None) -> None:
         self._acknowledge(to or link.client, link.mission_type, result, link.channel)
 
     def _begin_transfer(self, state: TransferState, message: AnyListMessage, channel: Channel, count: int) -> _Link:
@@ -187,8 +188,8 @@ class Px4MissionServer(MissionServer):
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         link = self._link(channel)
-        # PX4 ends a transfer if the number of its next item equals the number of stored items (mavlink_mission.cpp,
-        # handle_mission_request_list). If this ends an upload, PX4 refuses other uploads until a download times out.
+        # PX4 ends a transfer whose next index equals the number of stored items (mavlink_mission.cpp,
+        # handle_mission_request_list). An upload that ends in this way blocks other uploads until a download times out.
         if link.next == self.count(link.mission_type):
             link.state = TransferState.IDLE
         is_same_transfer = link.client == sender_of(request) and link.mission_type == request.mission_type
@@ -200,7 +201,7 @@ class Px4MissionServer(MissionServer):
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         link = self._link(channel)
-        link.uses_int = isinstance(request, m.MissionRequestInt)  # even if another client sends it, as in PX4
+        link.uses_int = isinstance(request, m.MissionRequestInt)  # PX4 does this even for another client.
         if sender_of(request) != link.client:
             self._warn("WPM: REJ. CMD: partner id mismatch")
             return
@@ -272,7 +273,7 @@ class Px4MissionServer(MissionServer):
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
         link = self._link(channel)
-        link.uses_int = isinstance(message, m.MissionItemInt)  # even if another client sends it, as in PX4
+        link.uses_int = isinstance(message, m.MissionItemInt)  # PX4 does this even for another client.
         if sender_of(message) != link.client:
             self._warn("REJ. MIS ITEM: partner id mismatch")
         elif message.mission_type != link.mission_type:

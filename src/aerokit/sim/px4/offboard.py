@@ -27,7 +27,8 @@ _NAN3: Ned = (math.nan, math.nan, math.nan)
 # The simulated ground is level, so altitudes above terrain are treated as altitudes above home.
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
-_UPWARDS = 0.1  # A set-point lifts the vehicle off if it is more than this upwards, in m, m/s or m/s².
+# A set-point whose upward part exceeds this number of m, m/s or m/s² makes a vehicle on the ground take off.
+_MIN_TAKE_OFF_COMPONENT = 0.1
 _VERSION_1_14 = 1 << 24 | 14 << 16  # One byte each for the major and the minor version.
 _FLIGHT_CONTROL_GROUP, _THRUST_CONTROL = 0, 3
 
@@ -73,7 +74,7 @@ class Px4Offboard:
         _, _, velocity_down = self._velocity
         _, _, acceleration_down = self._acceleration
         components = (position_down - self._vehicle.motion.down, velocity_down, acceleration_down)
-        return any(down < -_UPWARDS for down in components)  # False for components that are NaN
+        return any(down < -_MIN_TAKE_OFF_COMPONENT for down in components)  # False for components that are NaN
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
         frame = target.coordinate_frame
@@ -181,7 +182,8 @@ class Px4Offboard:
         roll, pitch, yaw = attitude
         # In the simulation, a thrust of 0.5 holds the height.
         climb_share = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0
-        motion.seek_attitude(roll, pitch, -climb_share * _CLIMB_AT_FULL_THRUST_M_S)  # a velocity down
+        velocity_down = -climb_share * _CLIMB_AT_FULL_THRUST_M_S
+        motion.seek_attitude(roll, pitch, velocity_down)
         motion.face(yaw)
 
     def _wanted_velocity(self) -> Ned:

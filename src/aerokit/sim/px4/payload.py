@@ -24,7 +24,7 @@ from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
 
 # Values of MNT_MODE_IN that enable the gimbal. With 0, radio and MAVLink control the gimbal, with 4 MAVLink only.
-_FITTED_BY = frozenset({0, 4})
+_ENABLING_MODES = frozenset({0, 4})
 _DEVICE_ID = 1
 _LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
 _TAU_S, _STEP_S = 0.3, 0.0187
@@ -60,7 +60,7 @@ class Px4Gimbal:
 
     def start(self) -> None:
         parameters = self._px4.parameters
-        self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
+        self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _ENABLING_MODES
         self.rest()
         self.in_control = (0, 0)
         if self.is_fitted:
@@ -191,9 +191,14 @@ def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
 
 
 def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    requested = (to_int(command.param1), to_int(command.param2))
-    system, component = map(_id_in_control, requested, gimbal.in_control, gimbal.own_ids, command.sender)
-    gimbal.in_control = (system, component)
+    requested_system, requested_component = to_int(command.param1), to_int(command.param2)
+    system, component = gimbal.in_control
+    own_system, own_component = gimbal.own_ids
+    sender_system, sender_component = command.sender
+    gimbal.in_control = (
+        _id_in_control(requested_system, system, own_system, sender_system),
+        _id_in_control(requested_component, component, own_component, sender_component),
+    )
     return MavResult.ACCEPTED
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pkgutil
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.mavlink.enums import MavParamType, MavSeverity
@@ -32,7 +33,8 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 class Px4ParameterMount(ParameterPackMount):
     """``@PARAM`` files of PX4. Opening a file reports its exact size.
 
-    A block of 239 bytes never ends inside a value or a default. Uploaded parameters are applied as they arrive.
+    A download is padded, so that no block of 239 bytes, the payload of one MAVFTP packet, ends inside a value or a
+    default. Uploaded parameters are applied as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
@@ -41,6 +43,13 @@ class Px4ParameterMount(ParameterPackMount):
     def open(self, path: str, *, writing: bool) -> FileHandle:
         reader = super().open(path, writing=False)  # This also checks the path of a file to write.
         return _Writer(self._parameters, self._apply) if writing else reader
+
+
+class _Announced(NamedTuple):
+    """Number of entries and file size that the header of an uploaded file announces."""
+
+    entry_count: int
+    file_size: int
 
 
 class _Writer(FileHandle):
@@ -55,7 +64,7 @@ class _Writer(FileHandle):
         self._apply = apply
         self._pending = b""  # Received bytes that are not yet a complete entry.
         self._written = 0  # number of bytes received so far
-        self._announced: tuple[int, int] | None = None  # Number of entries and file size; None before the header.
+        self._announced: _Announced | None = None  # None before the header
         self._count = 0  # number of entries that were applied
         self._previous_name = b""  # name in the last entry; the next name may begin with the same letters
         self._is_rejected = False  # True once the upload has failed
@@ -71,13 +80,11 @@ class _Writer(FileHandle):
         self._pending += new_bytes
         self._written += len(new_bytes)
         self._parse()
-        if self._announced is not None:
-            _, size = self._announced
-            if self._written > size:
-                raise self._rejection()
+        if self._announced is not None and self._written > self._announced.file_size:
+            raise self._rejection()
 
     def close(self) -> None:
-        is_complete = not self._pending and self._announced == (self._count, self._written)
+        is_complete = not self._pending and self._announced == _Announced(self._count, self._written)
         if self._is_rejected or not is_complete:
             raise FileFault(EINVAL)
 
@@ -94,7 +101,7 @@ class _Writer(FileHandle):
             magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
                 raise self._rejection()
-            self._announced = (count, size)
+            self._announced = _Announced(count, size)
             self._pending = self._pending[HEADER.size :]
         while self._apply_next_entry():
             pass
@@ -190,9 +197,10 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 
 
 class Px4Signing(VehicleSigning):
-    """Message signing of PX4. A text reports a new key, and unsigned heartbeats are accepted.
+    """Message signing of PX4. A text reports a new key.
 
-    PX4 stores the time stamp only together with a new key. Version 1.16 does not support signing.
+    Unsigned HEARTBEAT, ADSB_VEHICLE and COLLISION messages are accepted. PX4 stores the time stamp only together with a
+    new key. Version 1.16 does not support signing.
     """
 
     def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:

@@ -26,9 +26,9 @@ from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
-# Sensor bits of SYS_STATUS: present, enabled, healthy, and (`_BOOTING`) healthy during the boot.
+# Sensor bits of SYS_STATUS.
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
-_HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
+_HEALTHY, _HEALTHY_DURING_BOOT = 0x1320C83F, 0x0320883F
 _GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
 _PREARM_BIT = int(MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK)
 # The MAV_STANDARD_MODE of each mode that has one.
@@ -78,7 +78,7 @@ def _state(px4: Px4Vehicle) -> MavState:
 
 
 def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
-    health = _HEALTHY if px4.is_ready else _BOOTING
+    health = _HEALTHY if px4.is_ready else _HEALTHY_DURING_BOOT
     if not px4.is_armed and not px4.arming.is_possible:
         health &= ~_PREARM_BIT
     if px4.faults.gps_lost:

@@ -73,8 +73,8 @@ class SimulatedPx4(Px4Vehicle):
 
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
-# `FixedWing.climb_rate_to` returns the distance to the target altitude divided by this time.
-_SINK_TARGET_LEAD_S = 2.5
+# `FixedWing.climb_rate_to` returns the vertical distance to the target divided by this time.
+_CLIMB_TIME_CONSTANT_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
 
@@ -167,7 +167,7 @@ class Px4PlaneFlight(Px4Flight):
     def circle_down(self) -> None:
         sink = self._plane.parameters["FW_T_SINK_MIN"]
         north, east, _ = self.target
-        self.target = (north, east, self._motion.down + sink * _SINK_TARGET_LEAD_S)
+        self.target = (north, east, self._motion.down + sink * _CLIMB_TIME_CONSTANT_S)  # makes the plane sink at `sink`
         self._land(self.circle)
 
     def descend(self) -> None:
@@ -321,7 +321,7 @@ _AMPERES_AT_FULL = 20.0
 class SimulatedPx4Plane(SimulatedPx4):
     """PX4 plane (MAV_TYPE 1, airframe 10041). `FixedWing` is the motion model. See `SimulatedPx4` for the arguments.
 
-    The plane takes off straight ahead, from a runway. Where a multicopter hovers, it circles at NAV_LOITER_RAD. RTL
+    The plane takes off straight ahead, from a runway. It never hovers, but circles with the radius NAV_LOITER_RAD. RTL
     ends in a circle above home, without a landing (RTL_LAND_DELAY is -1). LAND descends in circles. A mission must
     contain a landing (MIS_TKO_LAND_REQ), which has a straight glide path. OFFBOARD circles a position. Sticks control
     bank, climb and speed in every manual mode. The plane is not disarmed automatically before take-off.

@@ -22,8 +22,8 @@ from aerokit.transport.zenoh.keys import (
     ControlMode,
     KeySpace,
     RefusalNotice,
+    SendTime,
     check_name,
-    decode_sent_at,
 )
 from aerokit.transport.zenoh.session import (
     MAX_PAYLOAD_BYTES,
@@ -82,10 +82,8 @@ class ZenohConnect(NetworkLink):
         self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
-        # With control="take", True until a beacon shows that this client has control.
-        self._takes_control = control == "take"
         self._nonce = random.getrandbits(32)  # distinguishes this link from others that use the same client name
-        self._tracker = VehicleSideTracker(self._nonce, "never" if control == "never" else "free")
+        self._tracker = VehicleSideTracker(self._nonce, control)
         self._vehicle_tokens: set[str] = set()  # keys of the vehicle sides that are alive, as reported by the network
         self._publisher: Any = None  # None while the link is not open
         self._first_beacon = asyncio.Event()  # set once the vehicle side was found
@@ -103,7 +101,7 @@ class ZenohConnect(NetworkLink):
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. Drops data while beacons are missing."""
         if self._publisher is not None:
-            self._put(bytes(data), self._requested_mode())
+            self._put(bytes(data))
 
     # ---------------------------------------------------------------------------------- opening and closing
 
@@ -162,30 +160,27 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- receiving
 
     def _on_frames(self, data: bytes, attachment: bytes, _is_put: bool) -> None:
-        sent_at = decode_sent_at(attachment)
-        if sent_at is not None:
-            epoch, sent_s = sent_at
-            if self._tracker.accepts(epoch, sent_s, self._now()):
-                self._deliver(data)
+        sent = SendTime.decode(attachment)
+        if sent is not None and self._tracker.accepts(sent, self._now()):
+            self._deliver(data)
 
     def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
         if not is_put:  # A vehicle side that closes deletes its beacon.
-            sent_at = decode_sent_at(attachment)
-            if sent_at is not None:
-                closed_epoch, _ = sent_at
-                if closed_epoch == self._tracker.epoch:
-                    self._tracker.reset()
-                    self._lose("the vehicle side was closed")
+            sent = SendTime.decode(attachment)
+            if sent is not None and sent.epoch == self._tracker.epoch:
+                self._tracker.reset()
+                self._lose("the vehicle side was closed")
             return
         beacon = Beacon.decode(data)
         if beacon is None or not self._tracker.receive_beacon(beacon, self._now()):
             return
         self._first_beacon.set()
-        if self._takes_control:
-            self._takes_control = beacon.lease_holder != self.client
+        if self._tracker.mode == "take":
+            if beacon.lease_holder == self.client:
+                self._tracker.mode = "free"
             # An empty datagram with mode "take" requests control. Once this client has control, a last one is sent with
-            # the usual mode.
-            self._put(b"", self._requested_mode())
+            # mode "free".
+            self._put(b"")
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
         notice = RefusalNotice.decode(data)
@@ -205,13 +200,9 @@ class ZenohConnect(NetworkLink):
 
     # ---------------------------------------------------------------------------------- sending
 
-    def _requested_mode(self) -> ControlMode | None:
-        """Return the control mode for the next stamp. None is the usual mode of this client."""
-        return "take" if self._takes_control else None
-
-    def _put(self, data: bytes, mode: ControlMode | None) -> None:
+    def _put(self, data: bytes) -> None:
         """Send a datagram to the vehicle side, or drop it while beacons are missing."""
-        stamp = self._tracker.make_stamp(self._now(), mode)
+        stamp = self._tracker.make_stamp(self._now())
         if stamp is None:
             self._drop(1)
             return

@@ -9,7 +9,7 @@ Times are seconds on any monotonic clock.
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -24,7 +24,7 @@ from aerokit.mavlink.messages import (
     MissionAck,
     Statustext,
 )
-from aerokit.transport.zenoh.keys import Beacon, ControlMode, RefusalNotice, Stamp
+from aerokit.transport.zenoh.keys import Beacon, ControlMode, RefusalNotice, SendTime, Stamp
 
 if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
@@ -154,29 +154,28 @@ class ClientFilter:
         # Nonce of the program that uses this client name; None before its first datagram.
         self._nonce: int | None = None
         self._nonce_at = 0.0  # time of the last datagram from that program
-        # Message name → time of the last notice, and the number of refused messages since then.
-        self._notices: dict[str, tuple[float, int]] = {}
+        self._notices: dict[str, _LastNotice] = {}  # by message name
 
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
 
         ``nonce`` distinguishes programs that use the same client name by mistake.
         """
-        is_namesake = self._is_namesake(nonce, mode, now)
-        if not is_namesake:
+        has_name_conflict = self._has_name_conflict(nonce, mode, now)
+        if not has_name_conflict:
             self._lease.record_activity(self._client, now)
         accepted: list[bytes] = []
         notices: list[RefusalNotice] = []
         frames = self._framer.receive(data, now)
         if self._framer.waiting:  # A datagram consists of complete frames, so a partial frame at its end is dropped.
             self._framer = _framer()
-        may_control = mode != "never" and not is_namesake
+        may_control = mode != "never" and not has_name_conflict
         for frame in frames:
             if is_read_only(frame) or (may_control and self._lease.acquire(self._client, now)):
                 accepted.append(frame.raw)
                 continue
             holder = self._lease.holder(now) if may_control else None
-            if is_namesake:
+            if has_name_conflict:
                 reason = f"another program uses the client name {self._client}"
             elif holder is None:
                 reason = "this link is read-only (control=never)"
@@ -185,7 +184,7 @@ class ClientFilter:
             notices += self._refuse(frame, _decoded(frame), reason, holder, now)
         return b"".join(accepted), notices
 
-    def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
+    def _has_name_conflict(self, nonce: int, mode: ControlMode, now: float) -> bool:
         """Return True if another program recently used this client name."""
         is_other_program = self._nonce not in (None, nonce)
         is_recent = now - self._nonce_at <= LEASE_TIMEOUT_S
@@ -220,15 +219,20 @@ class ClientFilter:
         # A late command gets no answer, because the client may have sent it again. The client would take an answer to
         # the first transmission for an answer to the second one.
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
-        noticed_at, unreported = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
+        last = self._notices.get(name, _LastNotice(sent_at=-NOTICE_INTERVAL_S, unreported=0))
         # A notice with an answer is sent at once, because the client waits for the answer to its command.
-        if not answer and now - noticed_at < NOTICE_INTERVAL_S:
-            self._notices[name] = (noticed_at, unreported + 1)
+        if not answer and now - last.sent_at < NOTICE_INTERVAL_S:
+            self._notices[name] = _LastNotice(last.sent_at, last.unreported + 1)
             return []
         if len(self._notices) >= _MAX_NOTICES:
             self._notices.clear()
-        self._notices[name] = (now, 0)
-        return [RefusalNotice(name, reason, holder, answer, unreported + 1)]
+        self._notices[name] = _LastNotice(now, unreported=0)
+        return [RefusalNotice(name, reason, holder, answer, last.unreported + 1)]
+
+
+class _LastNotice(NamedTuple):
+    sent_at: float
+    unreported: int  # number of messages that were refused since then
 
 
 def _framer() -> Framer:
@@ -289,22 +293,28 @@ class FreshnessChecker:
         self.duplicates: int = 0
         """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0  # number of the last beacon
-        # Number and send time of the beacons whose numbers are accepted in stamps.
-        self._sent: deque[tuple[int, float]] = deque()
+        self._sent: deque[Beacon] = deque()  # beacons whose numbers are accepted in stamps
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()  # (client, nonce) → last sequence number
 
     def make_beacon(self, now: float, lease_holder: str | None = None) -> Beacon:
         self._expire(now)
         self._number += 1
-        self._sent.append((self._number, now))
-        return Beacon(self.epoch, self._number, now, lease_holder)
+        beacon = Beacon(self.epoch, self._number, now, lease_holder)
+        self._sent.append(beacon)
+        return beacon
 
-    def accepts(self, client: str, stamp: Stamp | None, now: float) -> bool:
-        """Return True if a datagram with this stamp is neither outdated nor a duplicate."""
+    def is_fresh(self, stamp: Stamp | None, now: float) -> bool:
+        """Return True if a datagram with this stamp is not outdated."""
         self._expire(now)
-        if stamp is None or not self._is_fresh(stamp):
-            self.late += 1
-            return False
+        if stamp is not None and stamp.epoch == self.epoch:
+            is_fresh = any(beacon.number == stamp.beacon for beacon in self._sent)
+        else:
+            is_fresh = False
+        self.late += not is_fresh
+        return is_fresh
+
+    def is_new(self, client: str, stamp: Stamp) -> bool:
+        """Return True if neither this datagram nor a later one of the client was received before."""
         key = client, stamp.nonce
         if stamp.sequence <= self._sequences.get(key, 0):
             self.duplicates += 1
@@ -315,17 +325,8 @@ class FreshnessChecker:
             self._sequences.popitem(last=False)  # the client that was silent for longest
         return True
 
-    def _is_fresh(self, stamp: Stamp) -> bool:
-        if stamp.epoch != self.epoch or not self._sent:
-            return False
-        (oldest_number, _), (newest_number, _) = self._sent[0], self._sent[-1]
-        return oldest_number <= stamp.beacon <= newest_number
-
     def _expire(self, now: float) -> None:
-        while self._sent:
-            _, sent_at = self._sent[0]
-            if now - sent_at <= MAX_DELAY_S:
-                return
+        while self._sent and now - self._sent[0].clock_s > MAX_DELAY_S:
             self._sent.popleft()
 
 
@@ -369,7 +370,9 @@ class VehicleSideTracker:
         """Number of datagrams and beacons dropped because another vehicle side with the same name sent them."""
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
-        self._nonce, self._mode = nonce, mode
+        self.mode: ControlMode = mode
+        """Control that the next stamps request."""
+        self._nonce = nonce
         self._beacon_number = 0  # number of the last valid beacon; 0 if there is none
         self._sequence = 0  # number of the last datagram sent
         self._delays = DelayEstimator()
@@ -396,25 +399,22 @@ class VehicleSideTracker:
         self.lease_holder = beacon.lease_holder
         return True
 
-    def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if a datagram is on time and from the tracked vehicle side.
-
-        ``sent_s`` is the send time on the vehicle side's clock.
-        """
-        if epoch != self.epoch:
+    def accepts(self, sent: SendTime, now: float) -> bool:
+        """Return True if a datagram is on time and from the tracked vehicle side."""
+        if sent.epoch != self.epoch:
             self.foreign += 1
             return False
-        if self._delays.delay(sent_s, now) > MAX_DELAY_S:
+        if self._delays.delay(sent.clock_s, now) > MAX_DELAY_S:
             self.late += 1
             return False
         return True
 
-    def make_stamp(self, now: float, mode: ControlMode | None = None) -> Stamp | None:
+    def make_stamp(self, now: float) -> Stamp | None:
         """Make the stamp for a datagram. None means that nothing may be sent, because beacons are missing."""
         if self.epoch is None or self.is_silent(now):
             return None
         self._sequence += 1
-        return Stamp(self.epoch, self._beacon_number, self._nonce, self._sequence, mode or self._mode)
+        return Stamp(self.epoch, self._beacon_number, self._nonce, self._sequence, self.mode)
 
     def is_silent(self, now: float) -> bool:
         return self._beacon_number == 0 or now - self.received_at > MAX_DELAY_S

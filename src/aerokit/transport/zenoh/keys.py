@@ -35,7 +35,7 @@ _ALL_CLIENTS = "all"
 _MAX_CLOCK_S = 2.0**48
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 _STAMP = struct.Struct(">BBIIII")  # version, control mode, epoch, beacon, nonce, sequence
-_SENT = struct.Struct(">BIQ")  # version, epoch, milliseconds on the sender's clock
+_SEND_TIME = struct.Struct(">BIQ")  # version, epoch, milliseconds on the sender's clock
 
 
 def check_name(argument: str, name: str) -> str:
@@ -197,17 +197,21 @@ class RefusalNotice(Snapshot):
         )
 
 
-def encode_sent_at(epoch: int, clock_s: float) -> bytes:
-    """Return the attachment of a datagram from the vehicle side."""
-    return _SENT.pack(VERSION, epoch, int(clock_s * 1000))
+class SendTime(Snapshot):
+    """Zenoh attachment of each datagram from the vehicle side."""
 
+    epoch: int
+    clock_s: float
 
-def decode_sent_at(data: bytes) -> tuple[int, float] | None:
-    """Return epoch and seconds from an attachment. None if it is invalid."""
-    if len(data) != _SENT.size:
-        return None
-    version, epoch, milliseconds = _SENT.unpack(data)
-    return (epoch, milliseconds / 1000) if version == VERSION else None
+    def encode(self) -> bytes:
+        return _SEND_TIME.pack(VERSION, self.epoch, int(self.clock_s * 1000))
+
+    @classmethod
+    def decode(cls, data: bytes) -> SendTime | None:
+        if len(data) != _SEND_TIME.size:
+            return None
+        version, epoch, milliseconds = _SEND_TIME.unpack(data)
+        return cls(epoch, milliseconds / 1000) if version == VERSION else None
 
 
 def _decode_object(data: bytes) -> dict[str, object]:

@@ -20,7 +20,7 @@ from aerokit.transport.zenoh.control_lease import (
     ControlLease,
     FreshnessChecker,
 )
-from aerokit.transport.zenoh.keys import Beacon, KeySpace, RefusalNotice, Stamp, check_name, encode_sent_at
+from aerokit.transport.zenoh.keys import Beacon, KeySpace, RefusalNotice, SendTime, Stamp, check_name
 from aerokit.transport.zenoh.session import (
     MAX_PAYLOAD_BYTES,
     LoopQueue,
@@ -40,8 +40,8 @@ CLIENT_TIMEOUT_S = 30.0
 """A client may be replaced by a new client after this silence."""
 
 _MIN_BEACON_INTERVAL_S = 0.02
-_RIVAL_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
-_RIVAL_QUERY_TIMEOUT_S = 1.0
+_BEACON_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
+_TOKEN_QUERY_TIMEOUT_S = 1.0
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -71,9 +71,9 @@ class ZenohListen(NetworkLink):
         self._refused = 0  # number of frames refused from clients that have left
         self._zenoh: Any = None  # the imported module; None before the opening
         self._publisher: Any = None  # sends to all clients; None while the link is not open
-        self._may_have_rival = False  # True if a liveliness token shows that the name may be in use
+        self._may_have_conflict = False  # True if a liveliness token shows that the name may be in use
         self._is_serving = False  # True while clients are served
-        self._rival_found = asyncio.Event()  # set when another vehicle side sends a beacon under this name
+        self._name_conflict = asyncio.Event()  # set when another vehicle side sends a beacon under this name
         self._beacon_at = 0.0  # time of the last own beacon
 
     @property
@@ -100,7 +100,7 @@ class ZenohListen(NetworkLink):
         """See `Link.write`. Data for all clients is sent once."""
         if self._session is None or not self._is_serving:
             return
-        attachment = encode_sent_at(self._freshness.epoch, self._now())
+        attachment = SendTime(self._freshness.epoch, self._now()).encode()
         if peer is None:
             self._put_or_drop(lambda: self._publisher.put(bytes(data), attachment=attachment))
         elif peer in self._clients:
@@ -114,13 +114,13 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
-        self._rival_found.clear()
+        self._name_conflict.clear()
         self._queue = queue = LoopQueue()
-        self._session = session = await open_session(self.address, self._options, partial(self._find_rivals, queue))
+        self._session = session = await open_session(self.address, self._options, partial(self._find_conflict, queue))
         self._released.clear()
-        if self._may_have_rival:
-            with anyio.move_on_after(_RIVAL_TIMEOUT_S):
-                await self._rival_found.wait()
+        if self._may_have_conflict:
+            with anyio.move_on_after(_BEACON_TIMEOUT_S):
+                await self._name_conflict.wait()
                 # After a time-out, the block ends in the line above. This line is reached only if a beacon arrived.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         with zenoh_errors(self.address, self._zenoh):
@@ -128,7 +128,7 @@ class ZenohListen(NetworkLink):
         self._is_serving = True
         self._send_beacon()
 
-    def _find_rivals(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
+    def _find_conflict(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
         """Subscribe to beacons, and check whether the name may be in use. Runs on a thread of the executor."""
 
         def on_beacon(sample: Any) -> None:
@@ -140,10 +140,10 @@ class ZenohListen(NetworkLink):
         declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
         # A token alone does not prove that the name is in use, because the token of a killed program remains for a
         # while. A beacon proves it.
-        tokens = session.liveliness().get(self._keys.vehicle_token(), timeout=_RIVAL_QUERY_TIMEOUT_S)
-        may_have_rival = bool(list(tokens))
+        tokens = session.liveliness().get(self._keys.vehicle_token(), timeout=_TOKEN_QUERY_TIMEOUT_S)
+        may_have_conflict = bool(list(tokens))
         if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
-            self._declared, self._may_have_rival = declared, may_have_rival
+            self._declared, self._may_have_conflict = declared, may_have_conflict
 
     def _serve(self, queue: LoopQueue, session: Any) -> None:
         """Declare the subscribers, the publisher and the token. Runs on a thread of the executor."""
@@ -166,7 +166,7 @@ class ZenohListen(NetworkLink):
             liveliness.declare_subscriber(keys.client_token(), on_liveliness, history=True),
             liveliness.declare_token(keys.vehicle_token(self._freshness.epoch)),
         ]
-        if queue is self._queue:  # See `_find_rivals`.
+        if queue is self._queue:  # See `_find_conflict`.
             self._publisher = publisher
             self._declared += declared
 
@@ -176,7 +176,7 @@ class ZenohListen(NetworkLink):
         if session is not None and self._is_serving:
             self._is_serving = False
             # The deletion of the beacon, with a send time of 0, tells clients that the vehicle side was closed.
-            goodbye = encode_sent_at(self._freshness.epoch, 0.0)
+            goodbye = SendTime(self._freshness.epoch, 0.0).encode()
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
                 session.delete(self._keys.beacon, congestion_control=drop, attachment=goodbye)
@@ -190,12 +190,11 @@ class ZenohListen(NetworkLink):
             return
         client.received_at = now
         stamp = Stamp.decode(attachment)
-        late_before = self._freshness.late
-        if not self._freshness.accepts(name, stamp, now) or stamp is None:
-            # A duplicate or overtaken datagram gets no notice, because its first copy or a newer one was processed.
-            is_late = self._freshness.late > late_before
-            if is_late:
-                self._send_notices(name, client.refuse_late(data, now), stamp)
+        if not self._freshness.is_fresh(stamp, now) or stamp is None:
+            self._send_notices(name, client.refuse_late(data, now), stamp)
+            return
+        # A duplicate or overtaken datagram gets no notice, because its first copy or a newer one was processed.
+        if not self._freshness.is_new(name, stamp):
             return
         if stamp.mode == "take":
             self._lease.take(name, now)
@@ -238,9 +237,9 @@ class ZenohListen(NetworkLink):
         beacon = Beacon.decode(data)
         if beacon is None or beacon.epoch == self._freshness.epoch:  # A beacon with this epoch is our own.
             return
-        if self._rival_found.is_set():  # Report a rival only once.
+        if self._name_conflict.is_set():  # Report a conflict only once.
             return
-        self._rival_found.set()
+        self._name_conflict.set()
         if self._is_serving:
             logger.warning("%s: another program serves the same name; clients keep the first one", self.address)
 

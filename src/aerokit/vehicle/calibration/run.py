@@ -154,7 +154,7 @@ class CalibrationRun:
         arbiter = self.context.arbiter
         # When another party takes over, the arbiter ends this order, and `_confirm_cancel` then sends no more cancel
         # commands.
-        order = self._cleanup.enter_context(arbiter.auxiliary_order())
+        order = self._cleanup.enter_context(arbiter.auxiliary_order(ends_with_actions=False))
         self._cancel_command_status = self._cleanup.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel_command)

@@ -114,10 +114,19 @@ class CameraOrders:
             raise
         order.commit()
 
-    async def command(self, command: int, *params: float, order: Order | None = None, **options: Any) -> None:
+    async def command(
+        self,
+        command: int,
+        *params: float,
+        order: Order | None = None,
+        attempts: int | None = None,
+        is_stop: bool = False,
+        **options: Any,
+    ) -> None:
         """Send a command, retried according to docs/reliability.md.
 
-        A newer order about the same topic ends the retries of ``order``.
+        A newer order about the same topic ends the retries of ``order``. So does a newer action, unless the command is
+        sent only once or ``is_stop`` is True.
         """
         if order is not None and not order.is_newest:
             raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}", was_sent=False)
@@ -125,20 +134,31 @@ class CameraOrders:
             order.may_move = True  # From here on, the camera may execute the order.
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
+        ends_with_actions = attempts != 1 and not is_stop
         # `sent.end` gives the reason once the command must no longer be repeated.
-        with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
+        with (
+            arbiter.auxiliary_order(order, ends_with_actions=ends_with_actions) as sent_order,
+            arbiter.sending(sent_order) as sent,
+        ):
             try:
                 await session.commands.send_long(
                     command,
                     *params,
                     component_id=self.component.component_id,
                     order_status=_ResendGuard(self, sent),
+                    attempts=attempts,
                     **options,
                 )
             except CommandRejected as error:
                 # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
                 raise session.with_reasons(error, started_at) from None
+            except CommandTimeout as error:
+                if not self.is_autopilot_attached and arbiter.is_state_recent:
+                    # The rest of the text has the age of the autopilot's HEARTBEAT.
+                    source = f"no HEARTBEAT of component {self.component.component_id} "
+                    error.args = (str(error).replace("no HEARTBEAT ", source),)
+                raise
 
     async def order_once(
         self,
@@ -192,12 +212,12 @@ class CameraOrders:
             try:
                 if order.is_newest:
                     try:
-                        await self.command(command, *params, order=order, was_just_sent=True)
+                        await self.command(command, *params, order=order, is_stop=True, was_just_sent=True)
                     except CommandTimeout:
                         if is_awaited:
                             raise
                         await self._session.wait_for_heartbeat()  # The command may have been lost in a silence.
-                        await self.command(command, *params, order=order)
+                        await self.command(command, *params, order=order, is_stop=True)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:

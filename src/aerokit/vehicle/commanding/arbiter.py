@@ -104,6 +104,11 @@ class CommandArbiter:
         is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
         return not order.is_withdrawn and not is_superseded
 
+    def is_replaced(self, order: Order) -> bool:
+        """Return True if a newer order is about the same topic; a newer action alone does not replace other orders."""
+        latest_orders = (self.latest(topic) for topic in order.ending_topics if topic != ACTION)
+        return any(latest is not None and latest.number > order.number for latest in latest_orders)
+
     def _register(self, order: Order, topics: Iterable[Topic]) -> None:
         self._latest.update(dict.fromkeys(topics, order))
 
@@ -178,8 +183,13 @@ class CommandArbiter:
     # ------------------------------------------------------------------ other orders, in blocks
 
     @contextmanager
-    def auxiliary_order(self, device_order: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
+    def auxiliary_order(
+        self, device_order: Order | None = None, *, ends_flight: bool = False, ends_with_actions: bool = True
+    ) -> Iterator[Order]:
         """Create an order that does not say where to fly (speed, home, arming …).
+
+        A newer action ends the order, unless ``ends_with_actions`` is False: for a command that is sent only once, and
+        for one that stops or releases a device.
 
         With ``device_order``, the new order is a part of it: a newer order about the same device ends both. Raises
         OperationRejected if a newer one was already given.
@@ -189,7 +199,8 @@ class CommandArbiter:
         # The vehicle may still change to the modes of the newest steering order.
         modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ending_topics
-        order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
+        action_topics = (ACTION,) if ends_with_actions else ()
+        order = self._create_order(modes, (*action_topics, *device_topics), ends_flight)
         self._orders.append(order)
         try:
             yield order

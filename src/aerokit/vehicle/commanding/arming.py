@@ -25,6 +25,7 @@ from aerokit.vehicle.commanding.arbiter import STEERING
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
+from aerokit.vehicle.commanding.sender import DISARM_REPORT_TIMEOUT_S
 from aerokit.vehicle.state.status_text import CHUNK_LENGTH
 
 if TYPE_CHECKING:
@@ -218,13 +219,10 @@ class ArmingActions(VehicleBase):
                 )
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
-            except CommandTimeout as error:
-                if not error.was_sent:
-                    raise
-                self._arm_cleanup.watch(order, was_armed)
-                raise CommandTimeout(f"{error}; {self._arm_cleanup.hint()}") from None
-            except (anyio.get_cancelled_exc_class(), AerokitError):
-                self._arm_cleanup.watch(order, was_armed)
+            except (anyio.get_cancelled_exc_class(), AerokitError) as error:
+                is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
+                if is_watched and isinstance(error, CommandTimeout):
+                    error.args = (f"{error}; {self._arm_cleanup.hint()}",)
                 raise
 
     async def disarm(
@@ -249,14 +247,16 @@ class ArmingActions(VehicleBase):
         """
         self._arm_cleanup.stop()
         started = self.connection.now()
+        report_timeout_s = min(timeout, DISARM_REPORT_TIMEOUT_S)
         with self._arbiter.auxiliary_order(ends_flight=True) as order:
             try:
-                await self._sender.send_arm(order, armed=False, force=force)
+                await self._sender.send_disarm(order, force=force, report_timeout_s=report_timeout_s)
             except CommandRejected as error:
                 # ArduCopter sends no status text when it refuses to disarm in the air (AP_Arming_Copter.cpp, disarm).
                 raise self._session.with_reasons(error, started, self._reason_if_flying()) from None
+            remaining_s = timeout - report_timeout_s
             await self._await_armed(
-                armed=False, order=order, started=started, timeout=timeout, max_silence_s=max_silence_s
+                armed=False, order=order, started=started, timeout=remaining_s, max_silence_s=max_silence_s
             )
 
     def _reason_if_flying(self) -> tuple[str, ...]:
@@ -352,12 +352,18 @@ class ArmingActions(VehicleBase):
         reboots_before = self._session.watch.reboots
         # A reboot is detected by a time since boot that is shorter than before, so request the present one.
         self._session.link_watch.request_time()
-        unanswered: CommandTimeout | None = None
-        with self._session.watch.expecting_reboot():
+        unanswered: CommandTimeout | OperationRejected | None = None
+        with (
+            self._session.watch.expecting_reboot(),
+            self._arbiter.auxiliary_order(ends_with_actions=False) as order,
+        ):
             try:
-                await self._order_reboot(force)
-            except CommandTimeout as error:
-                if not error.was_sent:
+                await self._order_reboot(order, force)
+            except CommandRejected:
+                raise
+            except (CommandTimeout, OperationRejected) as error:
+                # The reboot itself ends the wait for the acknowledgement.
+                if not order.was_sent:
                     raise
                 unanswered = error
             # A command that was not acknowledged was probably lost, so a wait shorter than the time-out is enough.
@@ -367,16 +373,17 @@ class ArmingActions(VehicleBase):
                 return
         # The vehicle has not rebooted in time.
         if unanswered is not None:
-            raise CommandTimeout(f"{unanswered}; the command is sent only once, and may still be executed")
+            unanswered.args = (f"{unanswered}; the command is sent only once, and may still be executed",)
+            raise unanswered
         raise OperationTimeout(
             f"reboot: the vehicle did not restart within {timeout:g} s; {self._session.describe_link()}"
         )
 
-    async def _order_reboot(self, force: bool) -> None:
+    async def _order_reboot(self, order: Order, force: bool) -> None:
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         # If only the acknowledgement is lost, a repetition would cause another reboot.
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ACK_TIMEOUT_S}
-        await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
+        await self._sender.send_long(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots_before: int) -> None:
         started = self.connection.now()

@@ -308,12 +308,16 @@ class ArmCleanup:
             " the vehicle's `async with` block, aerokit disarms it"
         )
 
-    def watch(self, order: Order, was_armed: bool) -> None:
-        """Watch in the background whether the abandoned arm command still arms the vehicle."""
+    def watch(self, order: Order, was_armed: bool) -> bool:
+        """Watch in the background whether the abandoned arm command still arms the vehicle.
+
+        Returns False if the program has given a newer arm or disarm command, which counts instead.
+        """
         if not self._is_newest_arm_command(order):
-            return
+            return False
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
         self._task.start(partial(self._watch_arming, order, was_armed, self._session.telemetry.mode.latest))
+        return True
 
     def _is_newest_arm_command(self, order: Order) -> bool:
         return order.arm_command == self._arbiter.arm_commands_sent
@@ -352,7 +356,7 @@ class ArmCleanup:
         with anyio.CancelScope(shield=True):
             try:
                 with self._arbiter.auxiliary_order(ends_flight=True) as disarm_order:
-                    await self._sender.send_arm(disarm_order, armed=False)
+                    await self._sender.send_disarm(disarm_order)
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 

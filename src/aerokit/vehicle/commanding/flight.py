@@ -179,10 +179,16 @@ class FlightActions(VehicleBase):
         is_amsl = self.autopilot.take_off_needs_home()
         started = self.connection.now()
 
+        # The vehicle keeps the altitude that it climbs to when home moves: PX4 corrects the altitude of home in flight,
+        # and `set_home` may be called during the climb.
+        target_amsl_m = plan.params[6] if is_amsl else -math.inf
+
         def missing_m() -> float:
-            if is_amsl:  # PX4 keeps the ordered altitude (param7) when it corrects the altitude of home in flight.
-                return plan.params[6] - self._position.altitude_amsl()
-            return altitude_m - self._position.altitude_relative()
+            nonlocal target_amsl_m
+            climb_m = altitude_m - self._position.altitude_relative()
+            if target_amsl_m == -math.inf and self._position.was_received_since(started):
+                target_amsl_m = self._position.altitude_amsl() + climb_m
+            return target_amsl_m - self._position.altitude_amsl() if math.isfinite(target_amsl_m) else climb_m
 
         def is_up() -> bool:
             return self._position.was_received_since(started) and missing_m() <= tolerance_m and not order.end

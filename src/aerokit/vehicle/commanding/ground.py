@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.vehicle.commanding.progress import FALL_SINK_M_S, HIT_GROUND, POSITION_MAX_AGE_S
-from aerokit.vehicle.state.telemetry import height_above_home
+from aerokit.vehicle.state.telemetry import altitude_amsl
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -77,7 +77,7 @@ class ImpactDetector:
         # Sink rate before the impact, and height of the vehicle at the impact. The sink rate is None if there was no
         # impact.
         self._impact_m_s: float | None = None
-        self._impact_height_m: float | None = None
+        self._impact_altitude_m: float | None = None
         # Height before the descent; None if it is unknown.
         self._top_m: float | None = None
         # True once the vehicle was slow over ground after the impact.
@@ -97,7 +97,7 @@ class ImpactDetector:
         interval_s = min(updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = updated_at
-        height_m = self.current_height()
+        altitude_m = self.current_altitude()
         sinks_fast = velocity.down_m_s >= IMPACT_M_S
         has_just_sunk_fast = updated_at - self._sank_fast_at <= max_stop_s
         has_stopped_suddenly = has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S
@@ -107,17 +107,17 @@ class ImpactDetector:
             self._sank_fast_at = updated_at
         elif has_stopped_suddenly:
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
-            if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
+            if self._top_m is None or altitude_m is None or self._top_m - altitude_m >= MIN_DROP_M:
                 self._impact_m_s = self._max_sink_m_s
                 # Even an old height is needed, so that a later height can show that the vehicle flies on.
-                self._impact_height_m = height_above_home(self._telemetry)
-        elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
+                self._impact_altitude_m = altitude_amsl(self._telemetry)
+        elif _has_changed(self._impact_altitude_m, altitude_amsl(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.
             self._impact_m_s = None
-            self._impact_height_m = None
+            self._impact_altitude_m = None
         # While the vehicle does not sink, this is the height before the next descent.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
-            self._top_m = height_m
+            self._top_m = altitude_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_slowed = self._impact_m_s is not None and (self._has_slowed or is_slow)
 
@@ -127,10 +127,10 @@ class ImpactDetector:
             return ""
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
 
-    def current_height(self) -> float | None:
-        """Return the height above home in metres; None if no recent position reports it."""
+    def current_altitude(self) -> float | None:
+        """Return the altitude above mean sea level in metres; None if no recent position reports it."""
         is_recent = self._telemetry.position.age <= POSITION_MAX_AGE_S
-        return height_above_home(self._telemetry) if is_recent else None
+        return altitude_amsl(self._telemetry) if is_recent else None
 
 
 class GroundCheck:
@@ -145,7 +145,7 @@ class GroundCheck:
         self._impact = ImpactDetector(session.telemetry)
         # Time and height of the report that the vehicle is on the ground.
         self._reported_at: float | None = None
-        self._reported_height_m: float | None = None
+        self._reported_altitude_m: float | None = None
         # Time since which the vehicle moves up or down slower than SETTLED_M_S; infinite while it moves faster.
         self._settled_since = math.inf
 
@@ -172,7 +172,7 @@ class GroundCheck:
         if self._reported_at is None:
             self._reported_at = now
             self._settled_since = math.inf
-            self._reported_height_m = self._impact.current_height()
+            self._reported_altitude_m = self._impact.current_altitude()
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
@@ -198,10 +198,10 @@ class GroundCheck:
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
             # The reported velocity may be wrong: if the height has not changed for STANDING_S, the vehicle stands on
-            # the ground. `current_height` ignores old heights, which would not change in a fall either.
-            height_m = self._impact.current_height()
-            is_known = height_m is not None and self._reported_height_m is not None
-            is_still = is_known and not _has_changed(self._reported_height_m, height_m, STANDING_M)
+            # the ground. `current_altitude` ignores old heights, which would not change in a fall either.
+            altitude_m = self._impact.current_altitude()
+            is_known = altitude_m is not None and self._reported_altitude_m is not None
+            is_still = is_known and not _has_changed(self._reported_altitude_m, altitude_m, STANDING_M)
             return is_still and now - reported_at >= STANDING_S
         self._settled_since = min(self._settled_since, max(updated_at, reported_at))
         return updated_at >= self._settled_since + SETTLING_S

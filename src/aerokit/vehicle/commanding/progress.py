@@ -11,7 +11,7 @@ from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavFrame, MavLandedState, MavSeverity
 from aerokit.position import Position
-from aerokit.vehicle.state.telemetry import height_above_home
+from aerokit.vehicle.state.telemetry import altitude_amsl, height_above_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -155,7 +155,7 @@ class StallDetector:
         self._place: Position | None = None
         self._there_since = -math.inf
         # The highest place and the fastest descent so far, for the error text.
-        self._max_height_m = -math.inf
+        self._max_altitude_m = -math.inf
         self._max_sink_m_s = 0.0
         self._sank_fast_at = -math.inf
 
@@ -180,18 +180,18 @@ class StallDetector:
 
     def _record_descent(self, here: Position) -> None:
         velocity = self._session.telemetry.velocity.latest
-        if here.altitude_relative_m is not None:
-            self._max_height_m = max(self._max_height_m, here.altitude_relative_m)
+        if here.altitude_amsl_m is not None:
+            self._max_altitude_m = max(self._max_altitude_m, here.altitude_amsl_m)
         sink_m_s = 0.0 if velocity is None else velocity.down_m_s
         self._max_sink_m_s = max(self._max_sink_m_s, sink_m_s)
         if sink_m_s >= FALL_SINK_M_S:
             self._sank_fast_at = self._there_since
 
     def _describe_descent(self, here: Position) -> str:
-        height_m = here.altitude_relative_m
-        if height_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._max_height_m - height_m <= 1.0:
+        altitude_m = here.altitude_amsl_m
+        if altitude_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._max_altitude_m - altitude_m <= 1.0:
             return ""
-        return f", after it descended {self._max_height_m - height_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
+        return f", after it descended {self._max_altitude_m - altitude_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
 
 
 def _approximate_distance_m(here: Position, place: Position) -> float:
@@ -200,7 +200,9 @@ def _approximate_distance_m(here: Position, place: Position) -> float:
     north_m = (here.latitude_deg - place.latitude_deg) * _METRES_PER_DEGREE
     east_at_equator_m = math.remainder(here.longitude_deg - place.longitude_deg, 360.0) * _METRES_PER_DEGREE
     horizontal_m = math.hypot(north_m, east_at_equator_m * math.cos(math.radians(here.latitude_deg)))
-    return horizontal_m + abs(VehiclePosition.height_above(here, place))
+    if here.altitude_amsl_m is None or place.altitude_amsl_m is None:
+        return horizontal_m
+    return horizontal_m + abs(here.altitude_amsl_m - place.altitude_amsl_m)
 
 
 _METRES_PER_DEGREE = 111_132.0
@@ -309,8 +311,8 @@ class VehiclePosition:
 
     def altitude_amsl(self) -> float:
         """Return the altitude above mean sea level in metres; −inf while unknown."""
-        here = self._telemetry.position.latest
-        return -math.inf if here is None or here.altitude_amsl_m is None else here.altitude_amsl_m
+        altitude = altitude_amsl(self._telemetry)
+        return -math.inf if altitude is None else altitude
 
     def home_altitude(self) -> float:
         """Return the altitude above mean sea level in metres. Raises ValueUnknownError if it is unknown."""

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
 from aerokit._internal.arguments import check_range
-from aerokit.errors import CommandRejected, CommandTimeout, HeartbeatTimeout, NotSupported, OperationRejected
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    HeartbeatTimeout,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, rejection
+from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, allowed_attempts, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
 from aerokit.vehicle.commanding.ground import ImpactDetector
-from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, MOTION, REQUEST_COMMANDS
+from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, MOTION, REQUEST_COMMANDS, SUPERSEDED
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
@@ -23,11 +30,13 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode, Purpose
     from aerokit.mavlink.messages import CommandAck
     from aerokit.vehicle.commanding.arbiter import CommandArbiter
-    from aerokit.vehicle.commanding.order import Order
+    from aerokit.vehicle.commanding.order import Order, SentCommand
     from aerokit.vehicle.session.session import VehicleSession
 
 FORCE = 21196
 """param2 of COMPONENT_ARM_DISARM that skips the pre-arm checks."""
+DISARM_REPORT_TIMEOUT_S = 2.5
+"""HEARTBEAT reports disarmed within this many seconds after a command to disarm, even if two of them are lost."""
 ACCEPTANCE_REVOKED = "the vehicle accepted the command and then refused it"
 
 
@@ -57,7 +66,8 @@ class OrderSender:
             OperationRejected: the order was superseded or taken over, or the computer slept.
             HeartbeatTimeout: the vehicle was silent before a second or later command.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
-            CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
+            CommandTimeout: there was no acknowledgement, although the order was neither superseded nor taken over; the
+                text says why the command was not sent again.
         """
         self.raise_if_ended(order)
         is_steering = STEERING in order.ending_topics
@@ -68,19 +78,23 @@ class OrderSender:
             # PX4 ends a take-off or a mission by a change to HOLD, which is no effect of the command.
             late_modes = self._arbiter.late_modes()
             modes = () if self._is_taking_off else tuple(mode for mode in modes if mode not in late_modes)
-        started = self._session.connection.now()
-        with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sent:
-            try:
-                await send(command, *params, order_status=sent, **options)
-            except CommandRejected as error:
-                # The vehicle may refuse a repetition because the command has already taken effect.
-                if not sent.is_confirmed:
-                    order.was_refused = True
-                    await self._session.wait_for_status_texts()
-                    raise self._session.with_reasons(error, started) from None
-            except CommandTimeout as error:
-                if not sent.is_confirmed:
-                    raise self._unanswered(error, order) from None
+        started, was_sent_before = self._session.connection.now(), order.was_sent
+        try:
+            with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sent:
+                try:
+                    await send(command, *params, order_status=sent, **options)
+                except CommandRejected as error:
+                    # The vehicle may refuse a repetition because the command has already taken effect.
+                    if not sent.is_confirmed:
+                        order.was_refused = True
+                        await self._session.wait_for_status_texts()
+                        raise self._session.with_reasons(error, started) from None
+                except CommandTimeout:
+                    if not sent.is_confirmed:
+                        raise
+        except CommandTimeout as error:
+            order.was_sent = was_sent_before or error.was_sent
+            raise self._unanswered(error, order, sent) from None
 
     @property
     def _is_taking_off(self) -> bool:
@@ -123,10 +137,14 @@ class OrderSender:
         if not order.only_stops and self._arbiter.slept_since(order.given_at) > 0:
             raise OperationRejected("the computer slept; the rest of the order was not sent")
 
-    def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
+    def _unanswered(self, error: CommandTimeout, order: Order, sent: SentCommand) -> Exception:
         """Return the error to raise for a command without an answer."""
         if order.takeover_reason or (order.failsafe and order.end):  # Another party has ended the order.
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
+        is_overruled = sent.end == SUPERSEDED and order.is_newest  # arm by disarm, or the reverse
+        if is_overruled or self._arbiter.is_replaced(order):
+            # A command in progress is awaited for a while after the newer order, so its error may not name that order.
+            return OperationRejected(str(error) if SUPERSEDED in str(error) else f"{error}; {SUPERSEDED}")
         return error
 
     async def send_arm(self, order: Order, *, armed: bool, force: bool = False) -> None:
@@ -134,6 +152,24 @@ class OrderSender:
         self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
         params = (float(armed), FORCE if force else 0)
         await self.send_long(order, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
+
+    async def send_disarm(
+        self, order: Order, *, force: bool = False, report_timeout_s: float = DISARM_REPORT_TIMEOUT_S
+    ) -> None:
+        """Send the command to disarm, and once more if HEARTBEAT still reports armed after ``report_timeout_s``.
+
+        A link that duplicates frames makes the vehicle answer twice, and the second answer to a command to arm looks
+        like an answer to this command.
+        """
+        armed, started = self._session.telemetry.armed, self._session.connection.now()
+        await self.send_arm(order, armed=False, force=force)
+        with suppress(OperationTimeout):
+            await armed.wait_until(
+                lambda is_armed: not is_armed and armed.updated_at > started, timeout=report_timeout_s
+            )
+            return
+        if not order.end and self._arbiter.is_state_recent:
+            await self.send_arm(order, armed=False, force=force)
 
     # ----------------------------------------------------------------------------------- modes
 
@@ -336,7 +372,8 @@ class OrderSender:
 
     async def auxiliary_command(self, command: int, *params: float, **options: Any) -> None:
         """Send a command that changes a setting and does not steer."""
-        with self._arbiter.auxiliary_order() as order:
+        is_repeatable = allowed_attempts(command, params) > 1
+        with self._arbiter.auxiliary_order(ends_with_actions=is_repeatable) as order:
             await self.send_long(order, command, *params, **options)
 
     # ---------------------------------------------------------------------------- raw commands
@@ -369,7 +406,7 @@ class OrderSender:
             if command == MavCmd.COMPONENT_ARM_DISARM:
                 armed = bool(params) and params[0] == 1  # A missing parameter is sent as 0.
             with (
-                self._raw_order(command, modes) as order,
+                self._raw_order(command, modes, is_repeatable=retries > 0) as order,
                 self._arbiter.sending(order, modes=modes, armed=armed) as sent,
             ):
                 return await send(command, *params, order_status=sent, **options)
@@ -378,10 +415,10 @@ class OrderSender:
             raise self._session.with_reasons(error, started) from None
 
     @contextmanager
-    def _raw_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
+    def _raw_order(self, command: int, modes: Collection[Mode], *, is_repeatable: bool) -> Iterator[Order]:
         subjects = CHANGED_BY_COMMAND.get(command, ())
         if subjects and subjects != ARM_ALONE:
             yield self._arbiter.raw_order(subjects, modes=modes)
         else:
-            with self._arbiter.auxiliary_order() as order:
+            with self._arbiter.auxiliary_order(ends_with_actions=is_repeatable) as order:
                 yield order

@@ -17,6 +17,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
+from aerokit.protocols.command import allowed_attempts
 from aerokit.vehicle.commanding.order import SUPERSEDED
 from aerokit.vehicle.commanding.progress import await_progress
 
@@ -135,7 +136,8 @@ class SimpleOrder(Snapshot):
             self.check_supported(context)
         if topic is not None and device_order is None:
             device_order = context.arbiter.device_order(topic)
-        with context.arbiter.auxiliary_order(device_order) as order:
+        is_repeatable = allowed_attempts(self.command, params) > 1
+        with context.arbiter.auxiliary_order(device_order, ends_with_actions=is_repeatable) as order:
             await context.sender.send_long(order, self.command, *params, component_id=component_id)
         if self.effect is not None:
             target = context.session.component_id if component_id is None else component_id

@@ -355,6 +355,8 @@ class TakeoverCheck:
         self._next_mode = next_mode
         self._mode_before = telemetry.mode.latest
         self._order_before = context.arbiter.latest(STEERING)
+        # True if the vehicle may still change to a mode of this order, e.g. of the hold after an abandoned flight.
+        self._may_change_late = context.arbiter.mode_is_in_doubt
         take_off_mode = autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol)
         hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
         self._end_of_take_off = (take_off_mode, hold_mode)
@@ -367,7 +369,9 @@ class TakeoverCheck:
         is_unchanged = before is None or mode == before
         # The end of a take-off, and a change to the mode that the caller wants to order, are not takeovers.
         is_end_of_take_off = (before, mode) == self._end_of_take_off
-        if is_unchanged or mode == self._next_mode or is_end_of_take_off:
+        order = self._order_before
+        is_late_effect = self._may_change_late and order is not None and mode is not None and order.is_own(mode)
+        if is_unchanged or mode == self._next_mode or is_end_of_take_off or is_late_effect:
             return
         raise OperationRejected(f"{operation}: the mode changed from {before} to {mode}; the order was not sent")
 

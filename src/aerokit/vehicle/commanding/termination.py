@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import Any, Literal
 
 from aerokit._internal.arguments import checks_arguments
-from aerokit.errors import CommandTimeout, LinkLost, NotSupported
+from aerokit.errors import CommandRejected, CommandTimeout, LinkLost, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
@@ -53,8 +53,10 @@ class TerminationActions(VehicleBase):
         try:
             command = MavCmd.DO_FLIGHTTERMINATION
             await self._sender.send_long(order, command, TERMINATE, modes=modes, armed=False, **SEND_ONCE)
-        except CommandTimeout as error:
-            if error.was_sent:
+        except CommandRejected:
+            raise
+        except (CommandTimeout, OperationRejected) as error:
+            if order.was_sent:
                 error.args = (f"{error}; the flight may have been terminated nevertheless",)
             raise
         armed, state = self.telemetry.armed, self.telemetry.system_status
@@ -97,12 +99,15 @@ class TerminationActions(VehicleBase):
         if not self.autopilot.can_shut_down:
             raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
         self._session.check_disarmed("shutdown")
-        try:
-            await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
-        except CommandTimeout as error:
-            if error.was_sent:
-                error.args = (f"{error}; the autopilot may have switched off nevertheless",)
-            raise
+        with self._arbiter.auxiliary_order(ends_with_actions=False) as order:
+            try:
+                await self._sender.send_long(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
+            except CommandRejected:
+                raise
+            except (CommandTimeout, OperationRejected) as error:
+                if order.was_sent:
+                    error.args = (f"{error}; the autopilot may have switched off nevertheless",)
+                raise
         with suppress(LinkLost):  # The link may go down with the autopilot.
             await await_progress(
                 self._session,

@@ -10,6 +10,7 @@ import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import (
+    AerokitError,
     CommandRejected,
     CommandTimeout,
     InvalidArgument,
@@ -49,6 +50,9 @@ POSITION_ONLY = 0x0DF8
 
 KEEP_THROTTLE = -1
 """param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
+
+HOME_TOLERANCE_M = 5.0
+"""Home counts as moved to a place within this distance; a COMMAND_LONG has a resolution of about two metres."""
 
 # A target that is sent without an acknowledgement is repeated at this interval in seconds.
 RESEND_INTERVAL_S = 1.0
@@ -342,7 +346,9 @@ class TravelActions(VehicleBase):
             )
 
     async def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait for the next HOME_POSITION after the acknowledgement.
+        """Move the home position, and wait until HOME_POSITION reports it after the acknowledgement.
+
+        While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
         COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
@@ -356,7 +362,7 @@ class TravelActions(VehicleBase):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: the vehicle accepted the command, but no HOME_POSITION was received.
+            OperationTimeout: the vehicle accepted the command, but HOME_POSITION did not report the new home.
         """
         if place is not None and place.altitude_amsl_m is None:
             raise InvalidArgument(
@@ -373,11 +379,26 @@ class TravelActions(VehicleBase):
                 position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
                 send = self._session.commands.send_place
                 await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
-        requested_at = self.connection.now()
-        # The vehicle has moved its home. Most vehicles then send HOME_POSITION without a request.
-        with suppress(CommandRejected, CommandTimeout):
-            await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
-        await home.wait_until(lambda _: home.updated_at >= requested_at, timeout=timeout, description="set_home")
+        acknowledged_at = self.connection.now()
+
+        def is_set(reported: Home) -> bool:
+            # A message with the old home may arrive after the acknowledgement.
+            is_there = place is None or reported.position.distance_to(place) <= HOME_TOLERANCE_M
+            return is_there and home.updated_at >= acknowledged_at
+
+        # Most vehicles send HOME_POSITION once when their home has moved, and this message may be lost.
+        task = self._session.background.start(self._request_home, "aerokit request of the home position")
+        try:
+            await home.wait_until(is_set, timeout=timeout, description="set_home")
+        finally:
+            if task is not None:
+                task.cancel()
+
+    async def _request_home(self) -> None:
+        with suppress(AerokitError):
+            while True:
+                await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
+                await anyio.sleep(RESEND_INTERVAL_S)
 
     def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres; infinite while the position is unknown.

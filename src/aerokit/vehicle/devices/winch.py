@@ -61,6 +61,7 @@ class Winch(ReadOnly):
             NotSupported: the autopilot has no such order. Nothing was sent.
             CommandRejected: there is no winch (WINCH_TYPE).
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: your program gave a newer order for this winch before the acknowledgement.
         """
         await self._send(WinchActions.RELAXED)
 
@@ -68,7 +69,8 @@ class Winch(ReadOnly):
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
         Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a second
-        one would pay out more line.
+        one would pay out more line. If the winch is turning already, it adds the length to that at which the command
+        arrives, and the call returns when the winch has stopped there.
 
         Args:
             length_m: metres, −1000 to 1000; negative values wind the line up.
@@ -90,25 +92,40 @@ class Winch(ReadOnly):
         # The order is created before the wait for a status. A newer order that is given during the wait then ends this
         # order.
         order = self._context.arbiter.device_order(self._topic)
-        status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
-        await self._context.sender.await_recent_state(order)  # The vehicle may have become silent during the wait.
-        if status_before is None:  # The requests may have been lost in a silence.
-            status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
-            await self._context.sender.await_recent_state(order)
-
-        def has_paid_out(status: m.WinchStatus) -> bool:
-            assert status_before is not None
-            goal_m = status_before.line_length + length_m
-            return abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M
-
+        status_before: m.WinchStatus | None = None
+        for _ in range(2):  # The first requests may be lost in a silence.
+            if status_before is None:
+                status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
+                await self._context.sender.await_recent_state(order)  # The vehicle may have become silent.
         await self._send(
             WinchActions.RELATIVE_LENGTH_CONTROL,
             length_m,
             rate_m_s,
-            is_done=None if status_before is None else has_paid_out,
+            is_done=None if status_before is None else self._has_paid_out(status_before, length_m),
             timeout=timeout,
             order=order,
         )
+
+    def _has_paid_out(self, status_before: m.WinchStatus, length_m: float) -> Callable[[m.WinchStatus], bool]:
+        """Return a function that returns True for a status which reports that the length was paid out.
+
+        The winch adds the length to that at which the command arrives. If the winch was turning, that length lies
+        between the one before and the one that it would have reached by the first status after the acknowledgement.
+        """
+        frame, now = status_before.received_frame, self._context.session.connection.now
+        reported_at = now() if frame is None else frame.received_at
+        was_turning = abs(status_before.speed) > RATE_TOLERANCE_M_S
+        turned_m: float | None = None
+
+        def has_paid_out(status: m.WinchStatus) -> bool:
+            nonlocal turned_m
+            if turned_m is None:
+                turned_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
+            start_m = status.line_length - length_m - status_before.line_length
+            is_near = abs(start_m - turned_m / 2) <= abs(turned_m / 2) + LENGTH_TOLERANCE_M
+            return is_near and (not was_turning or abs(status.speed) <= RATE_TOLERANCE_M_S)
+
+        return has_paid_out
 
     async def set_rate(self, rate_m_s: float) -> None:
         """Pay out line at this speed until the next order. Returns when WINCH_STATUS reports the speed.

@@ -18,7 +18,7 @@ from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.streams import TakeoverCheck
 from aerokit.vehicle.external.values import TargetMeasurement
-from aerokit.vehicle.state.telemetry import height_above_home
+from aerokit.vehicle.state.telemetry import altitude_amsl, height_above_home
 
 if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
@@ -117,7 +117,7 @@ class TargetLanding:
         # When the target was last visible, and the vehicle's height at that time.
         self._seen_at = -math.inf
         self._seen_height_m: float | None = None
-        # The lowest height so far, and the greatest climb above it.
+        # The lowest altitude so far, and the greatest climb above it.
         self._lowest_m = math.inf
         self._climbed_m = 0.0
         self._losses: list[TargetLoss] = []
@@ -157,10 +157,10 @@ class TargetLanding:
         landing_failure = self._context.sender.landing_failure(order)
 
         def is_down() -> bool:
-            height = height_above_home(self._session.telemetry)
-            if height is not None:  # A climb shows that the vehicle retries the landing or searches for the target.
-                self._lowest_m = min(self._lowest_m, height)
-                self._climbed_m = max(self._climbed_m, height - self._lowest_m)
+            altitude = altitude_amsl(self._session.telemetry)
+            if altitude is not None:  # A climb shows that the vehicle retries the landing or searches for the target.
+                self._lowest_m = min(self._lowest_m, altitude)
+                self._climbed_m = max(self._climbed_m, altitude - self._lowest_m)
             self._raise_if_source_failed()
             return ground.confirms(telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -15,7 +16,7 @@ from aerokit.protocols.ftp import FtpClient, FtpRequest, FtpSessionLost, path_by
 from aerokit.protocols.logs import LogDownload, LogList, LogStop
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+    from collections.abc import AsyncIterator, Awaitable, Iterator
 
     from aerokit.mavlink.messages import LogEntry
     from aerokit.protocols.blocks import Reassembly
@@ -34,6 +35,10 @@ SESSION_TIMEOUT_S: dict[int, float] = {MavFtpErr.INVALIDSESSION: 3.2, MavFtpErr.
 CLOSE_TIMEOUT_S = 3.0
 
 
+MissingRanges = Callable[[], tuple[tuple[int, int], ...]]
+"""Returns the ranges of bytes (begin, end) that have not arrived."""
+
+
 class RemoteFile(NamedTuple):
     """A file that the vehicle has opened: its session, and its size in bytes."""
 
@@ -41,10 +46,13 @@ class RemoteFile(NamedTuple):
     size: int
 
 
+class _ClosingSession(NamedTuple):
+    request: FtpRequest
+    task: asyncio.Task[None]
+
+
 @contextmanager
-def _limit(
-    description: str, timeout: float | None, missing: Callable[[], tuple[tuple[int, int], ...]]
-) -> Iterator[None]:
+def _limit(description: str, timeout: float | None, missing: MissingRanges) -> Iterator[None]:
     """Raise FileTimeout with the missing ranges if the block takes more than ``timeout`` seconds."""
     # A TimeoutError that the block itself raises, for example because of the disk, is not changed.
     with anyio.move_on_after(timeout) as scope:
@@ -69,9 +77,7 @@ class FileChannel:
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
-        # Maps the id of each session that is being closed in the background to the request that closes it, and to the
-        # task that sends this request.
-        self._closing: dict[int, tuple[FtpRequest, asyncio.Task[None]]] = {}
+        self._closing: dict[int, _ClosingSession] = {}  # by session id
 
     @asynccontextmanager
     async def operation(
@@ -80,12 +86,11 @@ class FileChannel:
         *,
         timeout: float | None,
         idle_timeout_s: float,
-        missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
+        missing: MissingRanges = tuple,
     ) -> AsyncIterator[None]:
         """Wait until earlier operations have ended, then run the block as the next operation.
 
-        Raises FileTimeout if this takes more than ``timeout`` seconds. ``missing()`` returns the byte ranges that have
-        not arrived, for the error.
+        Raises FileTimeout with the ``missing`` ranges if this takes more than ``timeout`` seconds.
         """
         with _limit(description, timeout, missing):
             async with self._lock:
@@ -216,17 +221,17 @@ class FileChannel:
             self.transfers.connection.send(request.message)
             task = self.transfers.background.start(lambda: self._confirm(request), "aerokit close file")
             if task is not None:
-                self._closing[session] = (request, task)
+                self._closing[session] = _ClosingSession(request, task)
 
     async def _confirm(self, request: FtpRequest) -> None:
         with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
             await self.transfers.run(request)
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
-        request, task = self._closing[session]
-        await asyncio.wait((task,))
-        if not request.is_answered:
-            await self._close(session, request.path, idle_timeout_s)
+        closing = self._closing[session]
+        await asyncio.wait((closing.task,))
+        if not closing.request.is_answered:
+            await self._close(session, closing.request.path, idle_timeout_s)
         self._closing.pop(session, None)
 
 
@@ -284,7 +289,7 @@ class LogChannel:
         self,
         description: str,
         timeout: float | None,
-        missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
+        missing: MissingRanges = tuple,
     ) -> AsyncIterator[None]:
         """Wait until earlier operations have ended, then run the block as the next operation.
 

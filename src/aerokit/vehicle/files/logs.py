@@ -60,6 +60,11 @@ class LogEntry(Snapshot):
     time_utc: datetime | None
 
 
+class _LocatedLog(NamedTuple):
+    entry: LogEntry
+    path: str | None  # for MAVFTP; None to use LOG_* messages
+
+
 class GrowthReporter:
     """Forwards the progress of a download, and logs an INFO message if the flight log is larger than listed."""
 
@@ -150,9 +155,8 @@ class Logs:
             OSError: the local file cannot be written, or another download of this program is writing it.
         """
         _check_id(log)
-        path, entry = await self._locate(log, method, idle_timeout_s, timeout)
-        listed_entry = entry if isinstance(log, int) else log  # the entry that the caller knows
-        growth = GrowthReporter(listed_entry, on_progress)
+        entry, path = await self._locate(log, method, idle_timeout_s, timeout)
+        growth = GrowthReporter(log if isinstance(log, LogEntry) else entry, on_progress)
         if path is not None:
             await self._files.download(
                 path, to, resume=resume, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=growth
@@ -187,9 +191,8 @@ class Logs:
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
         """
         _check_id(log)
-        path, entry = await self._locate(log, method, idle_timeout_s, timeout)
-        listed_entry = entry if isinstance(log, int) else log  # the entry that the caller knows
-        growth = GrowthReporter(listed_entry, on_progress)
+        entry, path = await self._locate(log, method, idle_timeout_s, timeout)
+        growth = GrowthReporter(log if isinstance(log, LogEntry) else entry, on_progress)
         if path is not None:
             content = await self._files.read(path, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=growth)
         else:
@@ -247,29 +250,29 @@ class Logs:
 
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
-    ) -> tuple[str | None, LogEntry]:
-        """Return a log's path for MAVFTP (None: use LOG_* messages instead), and its entry."""
+    ) -> _LocatedLog:
+        known = log if isinstance(log, LogEntry) else None
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
-        if isinstance(log, LogEntry) and not prefers_messages:
-            path = await self._path(log, idle_timeout_s)
+        if known is not None and not prefers_messages:
+            path = await self._path(known, idle_timeout_s)
             if path is not None:
-                return path, log
+                return _LocatedLog(known, path)
         try:
-            entry = await self._entry(log, idle_timeout_s, timeout, gives_up_early=method == "auto")
+            # With "auto", another method may work, so give up early.
+            max_unanswered = MAX_UNANSWERED_REQUESTS if method == "auto" else None
+            entry = await self._entry(log, idle_timeout_s, timeout, max_unanswered)
         except FileTimeout:
             # ArduPilot does not answer LOG_* messages while it is armed. MAVFTP can read a log whose entry is known.
-            if not isinstance(log, LogEntry) or method != "auto":
+            path = None if known is None or method != "auto" else await self._path(known, idle_timeout_s)
+            if known is None or path is None:
                 raise
-            path = await self._path(log, idle_timeout_s)
-            if path is None:
-                raise
-            return path, log
+            return _LocatedLog(known, path)
         if prefers_messages:
-            return None, entry
+            return _LocatedLog(entry, path=None)
         path = await self._path(entry, idle_timeout_s)
         if path is None and method == "ftp":
             raise _no_such_log(entry.id, "its file on the vehicle cannot be identified")
-        return path, entry
+        return _LocatedLog(entry, path)
 
     async def _path(self, entry: LogEntry, idle_timeout_s: float) -> str | None:
         """Return the path of a log for MAVFTP, or None if MAVFTP cannot be used for it."""
@@ -279,17 +282,12 @@ class Logs:
         return await log_path(self._files, directories, entry, idle_timeout_s, may_have_grown=entry == self._newest)
 
     async def _entry(
-        self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, gives_up_early: bool
+        self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, max_unanswered: int | None
     ) -> LogEntry:
-        """Return the current entry of a log.
-
-        With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
-        """
         log_id = log if isinstance(log, int) else log.id
         # For an id, request the whole list, because the log may not exist. ArduPilot answers the request for a single
         # nonexistent log by an endless list of nonexistent logs.
         only_id = None if isinstance(log, int) else log.id
-        max_unanswered = MAX_UNANSWERED_REQUESTS if gives_up_early else None
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only_id, max_unanswered)
         current = next((entry for entry in entries if entry.id == log_id), None)

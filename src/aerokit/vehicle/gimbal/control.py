@@ -120,7 +120,7 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
-        with self._orders.context.arbiter.auxiliary_order() as order:
+        with self._orders.context.arbiter.auxiliary_order(ends_with_actions=False) as order:
             await self._orders.context.sender.send_long(
                 order,
                 self._command,

@@ -164,6 +164,7 @@ class RoiMixin(GimbalMixin):
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
             GimbalTaken: your program had control and lost it.
+            OperationRejected: another order was given before the answer.
         """
         orders = self._orders
         orders.raise_if_taken()

@@ -12,6 +12,8 @@ from aerokit.autopilots import GimbalRules
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink.enums import GimbalManagerFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.messages import GimbalManagerInformation, MountConfigure, MountControl
+from aerokit.protocols.command import rejection
+from aerokit.vehicle.commanding.sender import ACCEPTANCE_REVOKED
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 NAN = math.nan
 PITCHYAW, CONFIGURE = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE
 MOUNT = MavCmd.DO_MOUNT_CONTROL
+
+AIMING_COMMANDS = (PITCHYAW, MOUNT, MavCmd.DO_SET_ROI_LOCATION, MavCmd.DO_SET_ROI_SYSID)
 
 # With these flags, roll and pitch are relative to the horizon, and yaw is relative to the vehicle's nose.
 LEVEL = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
@@ -302,6 +306,15 @@ class GimbalOrders:
         if not any(block.is_held for block in blocks):
             for block in blocks:
                 block.raise_if_taken()
+
+    def raise_if_refused(self, description: str, since: float) -> None:
+        """Raise CommandRejected if the manager has refused a command after ``since``, when it counted as accepted."""
+        for command in AIMING_COMMANDS:
+            result = self.session.commands.late_refusal(command, self.manager_id, since)
+            if result is not None:
+                error = rejection(command, result)
+                error.args = (f"{description}: {ACCEPTANCE_REVOKED}: {error}",)
+                raise error
 
     @property
     def is_taken(self) -> bool:

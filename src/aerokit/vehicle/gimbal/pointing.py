@@ -142,7 +142,8 @@ async def wait_until_reached(
     Raises the errors of `Gimbal.point`.
     """
     session = orders.session
-    deadline = session.connection.now() + timeout
+    accepted_at = session.connection.now()
+    deadline = accepted_at + timeout
     checked_at = since  # time of the last attitude that was checked
     # Compare the reboots of `public_device`, because `attitude_source` and `device` may become other gimbals.
     reboots_before = orders.public_device.reboots
@@ -156,6 +157,7 @@ async def wait_until_reached(
                 reason = "the vehicle rebooted" if has_rebooted else SUPERSEDED
                 raise OperationRejected(f"{description}: {reason}")
             orders.raise_if_taken()
+            orders.raise_if_refused(description, accepted_at)
             if source.attitude.is_known and source.attitude.updated_at > checked_at:
                 checked_at = source.attitude.updated_at
                 if target.is_reached(source):

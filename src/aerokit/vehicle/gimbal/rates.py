@@ -128,6 +128,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
                 await zero.send_and_wait(f"{self._orders.name}: rates of zero")
+                self._orders.raise_if_taken()  # If control was lost meanwhile, the gimbal may still turn.
             else:
                 zero.send_soon()
         elif error is None and not self._has_raised_stop:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
 
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import ConnectionClosed
 from aerokit.events import MissionCurrentChanged, MissionFinished, MissionItemReached
-from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MissionState
+from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType, MissionState
 from aerokit.mavlink.messages import MissionAck, MissionCurrent
 from aerokit.position import position_with_altitude
 from aerokit.protocols.exchange import is_addressed_to
@@ -28,6 +28,13 @@ if TYPE_CHECKING:
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.session.session import VehicleSession
     from aerokit.vehicle.session.transfers import Transfers
+
+# Maps commands that land the vehicle at the end of a mission to the mode in which it may do so.
+LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
+    MavCmd.NAV_RETURN_TO_LAUNCH: "return",
+    MavCmd.NAV_LAND: "land",
+    MavCmd.NAV_VTOL_LAND: "land",
+}
 
 # Maximum age of a reported plan id: two and a half periods of MISSION_CURRENT, which is sent at 1 Hz.
 PLAN_ID_MAX_AGE_S = 2.5
@@ -68,6 +75,13 @@ class PlanCache:
         self.changes += 1
 
 
+class PlanVersion(NamedTuple):
+    """Value that changes whenever this program notices a change of the vehicle's plan."""
+
+    changes: int  # also counts the plans of other stations on a shared link
+    plan_id: int  # the vehicle's id; 0 except on PX4
+
+
 class PlanContext:
     """State shared by the mission, the fence and the rally points of one vehicle.
 
@@ -91,7 +105,12 @@ class PlanContext:
             session.connection.bus.attach(MissionAck, self._on_ack, system_id=session.system_id),
             session.connection.bus.attach_event(MissionFinished, self._on_finished),
         )
-        self.tracker: MissionTracker = MissionTracker(session)
+        self.tracker: MissionTracker = MissionTracker(session, self._may_end_by_landing)
+
+    def _may_end_by_landing(self) -> bool:
+        """Return False if the last item of the mission is known, and is neither a landing nor a return."""
+        items = self.caches[MavMissionType.MISSION].items
+        return not items or items[-1].command in LANDING_PURPOSES
 
     def now(self) -> float:
         return self.session.connection.now()
@@ -118,11 +137,9 @@ class PlanContext:
         ids_by_mission_type = (current.mission_id, current.fence_id, current.rally_points_id)
         return ids_by_mission_type[mission_type]
 
-    def version(self, mission_type: int) -> tuple[int, int]:
-        """Return a value that changes whenever this program notices a change of the vehicle's plan."""
+    def version(self, mission_type: int) -> PlanVersion:
         cache = self.caches[mission_type]
-        # `changes` also counts the plans of other stations on a shared link. Only PX4 has a plan id other than 0.
-        return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
+        return PlanVersion(cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id)
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
         received, started_at = asyncio.Event(), self.now()
@@ -176,8 +193,9 @@ class MissionTracker:
     an active mission in its landing mode, and sends each MISSION_ITEM_REACHED ten times.
     """
 
-    def __init__(self, session: VehicleSession) -> None:
+    def __init__(self, session: VehicleSession, may_end_by_landing: Callable[[], bool]) -> None:
         self._session = session
+        self._may_end_by_landing = may_end_by_landing
         self._source = Source(session.system_id, session.component_id, "MISSION_CURRENT")
         self._offset = int(session.autopilot.home_is_item_0)  # number of items before the program's first item
         self._repeats_item_reached = session.autopilot.repeats_item_reached  # True for PX4.
@@ -293,7 +311,10 @@ class MissionTracker:
             self._complete()
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
-        if not is_armed and self._was_active and self.is_at_last_item and self.is_in_mission_mode:
+        # A vehicle that disarms on its way to a last waypoint has not flown the mission: it may have hit a slope.
+        may_be_complete = self.is_last_item_reached or self._may_end_by_landing()
+        was_at_end = self._was_active and self.is_at_last_item and self.is_in_mission_mode
+        if not is_armed and was_at_end and may_be_complete:
             self._complete()
         elif not is_armed and not self._was_active and self._session.connection.now() < self.stale_until:
             self.stale_until = math.inf  # This flight has not begun, so it cannot be complete.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from enum import Enum, auto
+from typing import TYPE_CHECKING
 
 import anyio
 
@@ -13,6 +14,7 @@ from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
+from aerokit.vehicle.missions.context import LANDING_PURPOSES
 from aerokit.vehicle.missions.plans import VehiclePlan
 from aerokit.vehicle.missions.stalling import MissionStallDetector
 from aerokit.vehicle.state.telemetry import is_reported_on_ground
@@ -32,13 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# Maps commands that land the vehicle at the end of a mission to the mode in which it may do so.
-LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
-    MavCmd.NAV_RETURN_TO_LAUNCH: "return",
-    MavCmd.NAV_LAND: "land",
-    MavCmd.NAV_VTOL_LAND: "land",
-}
-
 # Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 
@@ -48,6 +43,15 @@ END_REPORT_TIMEOUT_S = 10.0
 
 # A return may end at a rally point, whose position is unknown here, so it counts as finished after this time.
 RETURN_TIMEOUT_S = 300.0
+
+
+class Ending(Enum):
+    """The last item of a mission."""
+
+    UNKNOWN = auto()  # The items are unknown.
+    LANDING = auto()  # a landing, or a return with a landing
+    RETURN = auto()  # a return without a landing
+    OTHER = auto()
 
 
 class MissionEndDetector:
@@ -74,17 +78,20 @@ class MissionEndDetector:
         self._mode = mode
         self._order = vehicle_context.arbiter.newest  # the newest order when the wait began
         last_command = items[-1].command if items else None
-        is_return = last_command == MavCmd.NAV_RETURN_TO_LAUNCH
-        self._are_items_known = bool(items)
+        self._ending = Ending.OTHER
+        if last_command is None:
+            self._ending = Ending.UNKNOWN
+        elif last_command == MavCmd.NAV_RETURN_TO_LAUNCH and not session.autopilot.lands_after_return:
+            self._ending = Ending.RETURN
+        elif last_command in LANDING_PURPOSES:
+            self._ending = Ending.LANDING
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
-        self._is_last_item_landing_or_return = last_command in LANDING_PURPOSES
-        self._ends_by_return_without_landing = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         # Modes in which the vehicle may land: only that of the last item if this is a landing or a return.
         self._landing_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for command, purpose in LANDING_PURPOSES.items()
-            if command == last_command or not self._is_last_item_landing_or_return
+            if command == last_command or self._ending in (Ending.UNKNOWN, Ending.OTHER)
         ]
         # Until this time, HEARTBEAT may still report the mode before the mission.
         self._mode_grace_until = session.connection.now() + MODE_GRACE_S
@@ -104,7 +111,7 @@ class MissionEndDetector:
         if self._tracker.is_complete:
             return self._is_completion_final()
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
-        if self._ends_by_return_without_landing and self._is_landing:
+        if self._ending is Ending.RETURN and self._is_landing:
             return self._is_on_ground or self._has_returned()
         # The mission is not complete. The vehicle may fly it once more, so earlier observations do not count.
         self._return_began_at = None
@@ -118,14 +125,14 @@ class MissionEndDetector:
 
     def _is_completion_final(self) -> bool:
         """Return True if a complete mission needs no further return or landing."""
-        if self._ends_by_return_without_landing:
+        if self._ending is Ending.RETURN:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             completes_at_home = self._session.autopilot.mission_completes_at_home
             return completes_at_home or self._has_returned() or self._is_on_ground
-        if self._ends_by_landing_or_return:
+        if self._lands_or_returns:
             return self._is_on_ground
         # Known items do not end by a landing or a return here. Unknown items may, which the mode shows a little later.
-        return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
+        return self._ending is Ending.OTHER or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
         """Return True if the mission, which is complete now, has been complete for ``END_GRACE_S``."""
@@ -136,9 +143,9 @@ class MissionEndDetector:
         return now - self._completed_at >= END_GRACE_S
 
     @property
-    def _ends_by_landing_or_return(self) -> bool:
-        if self._are_items_known:
-            return self._is_last_item_landing_or_return
+    def _lands_or_returns(self) -> bool:
+        if self._ending is not Ending.UNKNOWN:
+            return self._ending is not Ending.OTHER
         # The items are unknown, but the vehicle's mode after the completion shows whether it lands.
         is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
@@ -189,8 +196,8 @@ class MissionEndDetector:
         """True if the vehicle executes the landing or the return that ends its mission."""
         current, last = self._tracker.current.latest, self._tracker.last_item
         # If the items are unknown, the number of the current item does not matter.
-        is_at_end = (current is not None and current == last) or not self._are_items_known
-        return is_at_end and self._ends_by_landing_or_return and self._is_in_landing_mode
+        is_at_end = (current is not None and current == last) or self._ending is Ending.UNKNOWN
+        return is_at_end and self._lands_or_returns and self._is_in_landing_mode
 
     @property
     def _is_in_landing_mode(self) -> bool:
@@ -255,6 +262,9 @@ class MissionControl(VehiclePlan["Mission"]):
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
         """Make ``item`` the current item. A vehicle that is flying its mission proceeds to it immediately.
 
+        A vehicle that has finished its mission stays where it is, also in its mission mode (ArduPilot), until you call
+        :meth:`resume`.
+
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
         without a position (a DO command) is executed; ``current`` then shows the item after it.
 
@@ -286,30 +296,17 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
-            OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
+            OperationRejected: the vehicle is not armed, its mode changed meanwhile, or no item is left to fly (PX4).
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
             OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
                 was busy with a transfer of plans.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._check_item(item)
-        vehicle_context, session = self._vehicle_context, self._session
-        mode = vehicle_context.sender.mode_for("mission.start", "mission")
-        if not session.telemetry.is_armed:
+        mode = self._vehicle_context.sender.mode_for("mission.start", "mission")
+        if not self._session.telemetry.is_armed:
             raise OperationRejected("mission.start: the vehicle is not armed: call arm() first; nothing was sent")
-        order = vehicle_context.arbiter.order(mode)
-        self._order = order
-        self._tracker.start()
-        try:
-            with vehicle_context.flight_cleanup.flying(order):
-                await self._set_current(item, timeout, order, keeps_jump_counts=False)
-                await self._enter_mode(mode, order, timeout)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the order.
-            vehicle_context.flight_cleanup.hold_in_background(order)
-            raise
-        if self._order is order:  # Otherwise, another task has paused the mission again.
-            self._is_paused = False
+        await self._fly(mode, timeout, first_item=item)
 
     async def pause(self) -> None:
         """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
@@ -339,15 +336,21 @@ class MissionControl(VehiclePlan["Mission"]):
 
         If its parameter MIS_RESTART is 1, ArduPilot starts again from the first item. Raises as :meth:`start`.
         """
-        vehicle_context, session = self._vehicle_context, self._session
-        mode = vehicle_context.sender.mode_for("mission.resume", "mission")
-        if not session.telemetry.is_armed:
+        mode = self._vehicle_context.sender.mode_for("mission.resume", "mission")
+        if not self._session.telemetry.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
+        await self._fly(mode, timeout)
+
+    async def _fly(self, mode: Mode, timeout: float, first_item: int | None = None) -> None:
+        """Make the vehicle fly its mission from ``first_item`` on, or from the current item."""
+        vehicle_context = self._vehicle_context
         order = vehicle_context.arbiter.order(mode)
         self._order = order
         self._tracker.start()
         try:
             with vehicle_context.flight_cleanup.flying(order):
+                if first_item is not None:
+                    await self._set_current(first_item, timeout, order, keeps_jump_counts=False)
                 await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the order.
@@ -386,7 +389,7 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
         cache = self._context.caches[MavMissionType.MISSION]
         items = (cache.items or ())[self._context.offset_of(MavMissionType.MISSION) :]
-        _, plan_id = self._version
+        plan_id = self._version.plan_id
         has_other_id = cache.plan_id != 0 and plan_id != cache.plan_id
         if has_other_id or self._tracker.count.latest not in (None, len(items)):
             items = ()  # Another ground station has replaced the mission, so its items are unknown.
@@ -441,7 +444,6 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item."""
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
@@ -470,7 +472,7 @@ class MissionControl(VehiclePlan["Mission"]):
                         return
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
 
-    async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand | None = None) -> None:
+    async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand) -> None:
         from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
@@ -478,9 +480,8 @@ class MissionControl(VehiclePlan["Mission"]):
         with transfers.limit(timeout):
             await self._context.lock.acquire()  # PX4 ignores MISSION_SET_CURRENT during a transfer.
         try:
-            if sent is not None:
-                self._vehicle_context.sender.raise_if_ended(sent.order)
-                await self._vehicle_context.sender.await_recent_state(sent.order)
+            self._vehicle_context.sender.raise_if_ended(sent.order)
+            await self._vehicle_context.sender.await_recent_state(sent.order)
             await transfers.run(
                 SetCurrentItem(
                     *target,
@@ -513,12 +514,24 @@ class MissionControl(VehiclePlan["Mission"]):
         texts = self._session.texts_since(acknowledged_at)
         return self._tracker.is_complete and end_text is not None and any(end_text in text for text in texts)
 
+    def _refusals(self, order: Order) -> tuple[str, ...]:
+        """Return PX4's texts since the order that there is no mission to fly. PX4 has then left the mode again."""
+        refusal = self._session.autopilot.no_mission_text
+        texts = self._session.texts_since(order.given_at)
+        return tuple(text for text in texts if refusal is not None and refusal in text)
+
     async def _order_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle_context, session = self._vehicle_context, self._session
         if not session.autopilot.mission_starts_by_command:
             await vehicle_context.sender.change_mode(
-                mode, order, timeout, reported_since=order.given_at, is_over=self._is_over
+                mode,
+                order,
+                timeout,
+                reported_since=order.given_at,
+                is_over=lambda acknowledged_at: bool(self._refusals(order)) or self._is_over(acknowledged_at),
             )
+            if refusals := self._refusals(order):
+                raise OperationRejected("the vehicle does not fly its mission", reasons=refusals)
             return
         try:
             with vehicle_context.arbiter.changing_mode():

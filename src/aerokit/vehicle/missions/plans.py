@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from aerokit.missions import Fence, RallyPoints
     from aerokit.protocols.exchange import OnProgress
-    from aerokit.vehicle.missions.context import PlanContext
+    from aerokit.vehicle.missions.context import PlanContext, PlanVersion
     from aerokit.vehicle.missions.transfer import PlanProtocol, PlanTransfer
 
 __all__ = ["FenceControl", "PlanMethod", "RallyControl", "VehiclePlan"]
@@ -124,7 +124,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             self._on_count(0)
 
     @property
-    def _version(self) -> tuple[int, int]:
+    def _version(self) -> PlanVersion:
         return self._context.version(self._get_plan_type().MISSION_TYPE)
 
     def _get_plan_type(self) -> type[PlanT]:

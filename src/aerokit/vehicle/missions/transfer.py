@@ -272,13 +272,12 @@ class PlanTransfer(Generic[PlanT]):
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
         while True:
             changes = self._cache.changes
-            items, plan_id = await self._receive(method)
+            received = await self._receive(method)
             if self._cache.changes == changes:  # Otherwise, the items may be those of two plans.
-                self._cache.set(items, self._context.now(), plan_id)
-                return items
+                self._cache.set(received.items, self._context.now(), received.opaque_id)
+                return received.items
 
-    async def _receive(self, method: str) -> tuple[tuple[MissionItem, ...], int]:
-        """Return the vehicle's plan and its id, which is 0 if unknown."""
+    async def _receive(self, method: str) -> DownloadResult:
         if await self._uses_file(method):
             try:
                 items = await self._channel.read_file()
@@ -286,9 +285,8 @@ class PlanTransfer(Generic[PlanT]):
                 self._on_file_error(error, method)
             else:
                 self._cache.has_file = True
-                return items, 0
-        received = await self._channel.receive()
-        return received.items, received.opaque_id
+                return DownloadResult(items, len(items), opaque_id=0)
+        return await self._channel.receive()
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
         """Return True if the plan is to be transferred as a file.
@@ -319,9 +317,8 @@ class PlanTransfer(Generic[PlanT]):
             self._cache.set(items, self._context.now(), result.opaque_id)
         if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
-        received = await self._read(method)
         try:
-            self._compare(dict(enumerate(items)), dict(enumerate(received)))
+            await self._verify(items, method)
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
@@ -340,9 +337,8 @@ class PlanTransfer(Generic[PlanT]):
         except (FileError, FileTimeout) as error:
             self._on_file_error(error, method)
         else:
-            received = await self._read(method)
             try:
-                self._compare(dict(enumerate(items)), dict(enumerate(received)))
+                await self._verify(items, method)
                 return
             except VerificationFailed:
                 if method == "ftp":
@@ -422,6 +418,9 @@ class PlanTransfer(Generic[PlanT]):
             return False  # The checksum did not arrive in time.
         self._cache.set(items, self._context.now(), checksum)
         return True
+
+    async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
+        self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
 
     def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:
         """Raise VerificationFailed if the items differ. Both mappings are keyed by seq."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Literal
@@ -17,7 +16,7 @@ from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S, RoundTrip, is_addressed_to
-from aerokit.vehicle.parameters.store import IN_FLIGHT_S, ParameterStore
+from aerokit.vehicle.parameters.store import STALE_VALUE_S, ParameterCache, ParameterStore, vehicle_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from aerokit.protocols.exchange import OnProgress
     from aerokit.protocols.parameter_requests import ParameterAnswer
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.parameters.store import ParameterCache
     from aerokit.vehicle.session.transfers import Transfers
 
 DownloadMethod = Literal["auto", "ftp", "list"]
@@ -39,14 +37,14 @@ ANSWER_DELAY_S = 0.1
 # Value of SET_MESSAGE_INTERVAL that restores the autopilot's default rate.
 DEFAULT_INTERVAL = 0
 # Seconds after a write in which late or repeated answers to it may arrive.
-ECHO_WINDOW_S = 3.0
+LATE_ANSWER_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
-MAX_READS_UNBOOSTED = 5
+MAX_READS_AT_DEFAULT_RATE = 5
 # Reading a few parameters raises ArduPilot's rate of answers after this many seconds. By then, the vehicle probably
 # lacks a parameter, whose request must be repeated.
-BOOST_DELAY_S = 0.5
+RAISE_DELAY_S = 0.5
 # Fewer changes than this are set one by one. A file would not be faster, and the vehicle confirms each value.
-MIN_PACK_SIZE = 10
+MIN_CHANGES_FOR_FILE = 10
 # If more values than this must be read back, the whole list is downloaded instead.
 MAX_READ_BACK = 100
 
@@ -60,13 +58,12 @@ class ParameterAccess:
         self._read_later_names: set[str] = set()  # names that `_read_later` will read
         self._download_lock = asyncio.Lock()
         self._write_lock = asyncio.Lock()
-        self._has_pack: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
+        self._has_file: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
         self._cached_read_round_trip: RoundTrip | None = None  # see `_read_round_trip`
-        self._boosts = 0  # number of running operations that need a raised rate of answers
+        self._rate_users = 0  # number of running operations that need a raised rate of answers
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
-        # Last value of each parameter that this program has written and the vehicle has confirmed.
-        self.written: dict[str, int | float] = {}
-        self._attempted: set[str] = set()  # names that this program has ever tried to write
+        # Last value of each parameter that this program has written; None until the vehicle confirms the value.
+        self.written: dict[str, int | float | None] = {}
 
     @property
     def _read_round_trip(self) -> RoundTrip:
@@ -82,7 +79,7 @@ class ParameterAccess:
 
     def forget(self) -> None:
         self.store.forget()
-        self._has_pack = None
+        self._has_file = None
 
     async def download(
         self,
@@ -99,8 +96,6 @@ class ParameterAccess:
                 return self.store.table
             cached_list = None
             if cache is not False and self._transfers.autopilot.has_parameter_hash:
-                from aerokit.vehicle.parameters.store import ParameterCache
-
                 cached_list = _CachedList(self, ParameterCache(None if cache is True else cache), idle_timeout_s)
                 is_loaded = await cached_list.load_if_current(refresh)
                 if is_loaded:
@@ -113,12 +108,12 @@ class ParameterAccess:
                     return self.store.table
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
-        if method == "ftp" or (method == "auto" and await self.has_pack()):
+        if method == "ftp" or (method == "auto" and await self.has_file()):
             # With "auto", the probe ends the attempt if MAVFTP does not answer, and the list is downloaded instead.
             probe = nullcontext() if method == "ftp" else self._ftp_probe()
             try:
                 with probe:
-                    await self._download_pack(idle_timeout_s, on_progress)
+                    await self._download_file(idle_timeout_s, on_progress)
                 return
             except (FileError, FileTimeout, RemoteProtocolError) as error:
                 if method == "ftp":
@@ -127,7 +122,7 @@ class ParameterAccess:
                 is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
-                self._has_pack = None if is_temporary else False  # With None, the next download tries the file again.
+                self._has_file = None if is_temporary else False  # With None, the next download tries the file again.
         await self._download_list(idle_timeout_s, on_progress)
 
     @contextmanager
@@ -159,13 +154,13 @@ class ParameterAccess:
         if scope.cancelled_caught:
             raise FileTimeout(f"the vehicle did not answer MAVFTP requests within {timeout_s:.1f} s")
 
-    async def has_pack(self) -> bool:
-        if self._has_pack is not None:
-            return self._has_pack
+    async def has_file(self) -> bool:
+        if self._has_file is not None:
+            return self._has_file
         capabilities = await self._transfers.capabilities()
         return bool(capabilities and capabilities & MavProtocolCapability.FTP)
 
-    async def _download_pack(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
+    async def _download_file(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         from aerokit.parameters.pack import PACK_PATH, PACK_PATH_WITH_DEFAULTS, unpack_parameters
 
         # ArduPilot generates the file while it is read. If a parameter changes from its default value meanwhile, all
@@ -181,7 +176,7 @@ class ParameterAccess:
                     raise
             else:
                 self.store.replace(self._with_known_defaults(table), updates_before=updates_before)
-                self._has_pack = True
+                self._has_file = True
                 return
 
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
@@ -207,7 +202,7 @@ class ParameterAccess:
             on_progress=on_progress,
         )
         updates_before = self.store.updates
-        with self._boosted():
+        with self._raised_rate():
             table = await transfers.run(exchange)
         self.store.replace(self._with_known_defaults(table), updates_before=updates_before)
 
@@ -222,7 +217,7 @@ class ParameterAccess:
         from aerokit.protocols.parameter_requests import ParameterReads
 
         transfers, store = self._transfers, self.store
-        replaced_values = {name: store.replaced_value(name) for name in names}
+        stale_values = {name: store.stale(name) for name in names}
         exchange = ParameterReads(
             transfers.system_id,
             transfers.component_id,
@@ -230,18 +225,18 @@ class ParameterAccess:
             bytewise=store.bytewise,
             probe=probe,
             alternatives={name: other_names(name) for name in names} if probe else {},
-            possibly_stale={name: value for name, value in replaced_values.items() if value is not None},
+            possibly_stale={name: stale.value for name, stale in stale_values.items() if stale is not None},
             own_system=transfers.connection.source_system,
             round_trip=self._read_round_trip,
             idle_timeout_s=idle_timeout_s,
         )
-        if len(names) > MAX_READS_UNBOOSTED:
-            boost_after_s = 0.0
+        if len(names) > MAX_READS_AT_DEFAULT_RATE:
+            raise_after_s: float | None = 0.0
         elif probe:  # A missing parameter is requested several times.
-            boost_after_s = BOOST_DELAY_S
+            raise_after_s = RAISE_DELAY_S
         else:
-            boost_after_s = math.inf
-        with self._boosted(after_s=boost_after_s):
+            raise_after_s = None
+        with self._raised_rate(raise_after_s):
             return await transfers.run(exchange)
 
     def _read_later(self, name: str, time: float) -> None:
@@ -259,30 +254,33 @@ class ParameterAccess:
             self._transfers.background.start(read, f"aerokit read of {name}")
 
     @contextmanager
-    def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
-        """Raise the rate at which ArduPilot handles parameters, from ``after_s`` seconds on until the block ends."""
+    def _raised_rate(self, after_s: float | None = 0.0) -> Iterator[None]:
+        """Raise the rate at which ArduPilot handles parameters, from ``after_s`` seconds on until the block ends.
+
+        None leaves the rate unchanged.
+        """
         interval_s = self._transfers.autopilot.parameter_interval_s
-        if interval_s is None or after_s == math.inf:
+        if interval_s is None or after_s is None:
             yield
             return
-        is_boosted = False
+        is_raised = False
 
-        def boost() -> None:
-            nonlocal is_boosted
-            is_boosted = True
-            self._boosts += 1
-            if self._boosts == 1:
+        def raise_rate() -> None:
+            nonlocal is_raised
+            is_raised = True
+            self._rate_users += 1
+            if self._rate_users == 1:
                 # ArduPilot handles parameters at the rate of the message PARAM_VALUE.
                 self._set_interval(interval_s * 1e6)  # microseconds
 
-        timer = asyncio.get_running_loop().call_later(after_s, boost)
+        timer = asyncio.get_running_loop().call_later(after_s, raise_rate)
         try:
             yield
         finally:
             timer.cancel()
-            if is_boosted:
-                self._boosts -= 1
-                if not self._boosts:
+            if is_raised:
+                self._rate_users -= 1
+                if not self._rate_users:
                     self._set_interval(DEFAULT_INTERVAL)
 
     def _set_interval(self, interval_us: float) -> None:
@@ -321,9 +319,9 @@ class ParameterAccess:
             on_progress=on_progress,
         )
         # Many reads need the raised rate.
-        boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
+        raise_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
         try:
-            with self._boosted(after_s=boost_after_s):
+            with self._raised_rate(raise_after_s):
                 answers = await transfers.run(exchange)
         finally:
             # Answers to a write that was cancelled or failed may also arrive late.
@@ -334,11 +332,11 @@ class ParameterAccess:
             self.written[name] = answer.value
             # A late answer with the previous value must not replace the new one in the store.
             if name in old_values and answer.value != old_values[name]:
-                self.store.mark_replaced(name, old_values[name])
+                self.store.set_stale(name, old_values[name])
             stored = self.store.get(name)
             if stored is not None and not same_value(stored.value, answer.value):
                 # Another value arrived after the answer. It may be a late answer, so the parameter is read again.
-                self._read_later(name, transfers.connection.now() + IN_FLIGHT_S)
+                self._read_later(name, transfers.connection.now() + STALE_VALUE_S)
         return answers
 
     def is_in_doubt(self, name: str) -> bool:
@@ -346,24 +344,25 @@ class ParameterAccess:
 
         The last write was cancelled or not confirmed, or a message with another value has arrived after it.
         """
-        known, written = self.store.get(name), self.written.get(name)
-        return name in self._attempted and not (known and written is not None and same_value(known.value, written))
+        if name not in self.written:
+            return False
+        known, written = self.store.get(name), self.written[name]
+        return known is None or written is None or not same_value(known.value, written)
 
     def _forget_written(self, names: Iterable[str]) -> None:
         # The vehicle may have other values from now on.
         for name in names:
-            self._attempted.add(name)
-            self.written.pop(name, None)
-            self.store.unmark_replaced(name)
+            self.written[name] = None
+            self.store.clear_stale(name)
 
     def _recently_written(self) -> set[str]:
         # A late answer to the last write of these parameters could be taken for the answer to their next write. The
         # next write is therefore verified by a read.
-        earliest = self._transfers.connection.now() - ECHO_WINDOW_S
+        earliest = self._transfers.connection.now() - LATE_ANSWER_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
 
-    async def write_pack(
+    async def write_file(
         self,
         parameters: Iterable[Parameter],
         method: UploadMethod,
@@ -377,7 +376,7 @@ class ParameterAccess:
         parameters = tuple(parameters)
         if not parameters:
             return {}
-        if method == "auto" and (len(parameters) < MIN_PACK_SIZE or not await self.has_pack()):
+        if method == "auto" and (len(parameters) < MIN_CHANGES_FOR_FILE or not await self.has_file()):
             method = "set"
         if method == "set":
             return await self.write(parameters, idle_timeout_s, on_progress)
@@ -387,7 +386,7 @@ class ParameterAccess:
         async with self._write_lock:
             self._forget_written(_names(parameters))
             try:
-                await self._upload_pack(parameters, idle_timeout_s, on_progress)
+                await self._upload_file(parameters, idle_timeout_s, on_progress)
                 answers = await self._read_back(parameters, idle_timeout_s)
             except (FileError, FileTimeout):  # With "auto", all parameters are set one by one instead.
                 if method == "ftp":
@@ -398,7 +397,7 @@ class ParameterAccess:
             later_answers = await self._write(not_applied, idle_timeout_s, on_progress)
             return {param.name: answers[param.name] for param in applied} | later_answers
 
-    async def _upload_pack(
+    async def _upload_file(
         self, parameters: tuple[Parameter, ...], idle_timeout_s: float, on_progress: OnProgress | None
     ) -> None:
         from aerokit.parameters.pack import PACK_PATH, pack_parameters
@@ -451,8 +450,6 @@ class _CachedList:
                 self._cache.save(key, self._hash, self._access.store.table)
 
     async def _key(self) -> str:
-        from aerokit.vehicle.parameters.store import vehicle_key
-
         transfers = self._access._transfers
         await transfers.capabilities()
         return vehicle_key(transfers.autopilot.name, transfers.system_id, transfers.version)

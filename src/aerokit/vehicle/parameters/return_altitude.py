@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.arguments import check_range
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
+    from aerokit.parameters import Parameter
     from aerokit.vehicle.parameters.parameters import Parameters
     from aerokit.vehicle.session.session import VehicleSession
 
@@ -17,8 +18,8 @@ MAX_RETURN_ALTITUDE_M = 3000
 
 
 async def read_return_altitude(parameters: Parameters, session: VehicleSession) -> float:
-    _, value, units_per_metre = await _find_parameter("return_altitude", parameters, session)
-    return round(value / units_per_metre, 3)
+    found = await _find_parameter("return_altitude", parameters, session)
+    return round(found.parameter.value / found.units_per_metre, 3)
 
 
 def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vtol: bool) -> float | None:
@@ -31,12 +32,17 @@ def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vt
 
 async def write_return_altitude(parameters: Parameters, session: VehicleSession, altitude_m: float) -> None:
     check_range("altitude_m", altitude_m, 0, MAX_RETURN_ALTITUDE_M, above=True)
-    name, _, units_per_metre = await _find_parameter("set_return_altitude", parameters, session)
-    await parameters.set(name, altitude_m if units_per_metre == 1 else round(altitude_m * units_per_metre))
+    found = await _find_parameter("set_return_altitude", parameters, session)
+    value = altitude_m if found.units_per_metre == 1 else round(altitude_m * found.units_per_metre)
+    await parameters.set(found.parameter.name, value)
 
 
-async def _find_parameter(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
-    """Return name, value and units per metre of the vehicle's altitude parameter."""
+class _AltitudeParameter(NamedTuple):
+    parameter: Parameter
+    units_per_metre: float
+
+
+async def _find_parameter(action: str, parameters: Parameters, session: VehicleSession) -> _AltitudeParameter:
     autopilot = session.autopilot
     names_and_units = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
     if not names_and_units:
@@ -46,7 +52,7 @@ async def _find_parameter(action: str, parameters: Parameters, session: VehicleS
     for name, units_per_metre in names_and_units:
         answer = answers[name]
         if not isinstance(answer, (ParameterRejected, ParameterTimeout)):
-            return name, answer.value, units_per_metre
+            return _AltitudeParameter(answer, units_per_metre)
         failures.append(answer)
     # A time-out takes precedence, because the vehicle may have this parameter.
     raise next((failure for failure in failures if isinstance(failure, ParameterTimeout)), failures[0])

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.events import ParameterChanged
 from aerokit.mavlink.messages import ParamValue
@@ -25,16 +25,22 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.transfers import Transfers
 
 # Seconds in which messages with the previous value may still arrive after a write.
-IN_FLIGHT_S = 1.0
+STALE_VALUE_S = 1.0
+
+
+class StaleValue(NamedTuple):
+    """Value of a parameter before its last write, and the time until which messages with this value are ignored."""
+
+    value: int | float
+    ignored_until: float
 
 
 class ParameterStore:
     """The known parameters by name. Publishes :class:`ParameterChanged` when a known value changes."""
 
-    def __init__(self, transfers: Transfers, on_discarded: Callable[[str, float], None]) -> None:
+    def __init__(self, transfers: Transfers, read_later: Callable[[str, float], None]) -> None:
         self._transfers = transfers
-        # Called after a message that may be late, with the parameter's name and the time after which its values count.
-        self._on_discarded = on_discarded
+        self._read_later = read_later  # reads a parameter in the background at a time
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table, built when it is needed; None after a change.
         self._table: ParameterTable | None = ParameterTable()
@@ -47,9 +53,7 @@ class ParameterStore:
         self.count: int | None = None
         # Maps each name to the value of `updates` at the last message with this parameter.
         self._last_updates: dict[str, int] = {}
-        # Maps each written parameter to its previous value, and to the time until which messages with that value are
-        # ignored.
-        self._replaced: dict[str, tuple[int | float, float]] = {}
+        self._stale: dict[str, StaleValue] = {}
 
     @property
     def table(self) -> ParameterTable:
@@ -69,24 +73,21 @@ class ParameterStore:
     def __contains__(self, name: object) -> bool:
         return name in self._known
 
-    def mark_replaced(self, name: str, value: float) -> None:
-        """Ignore messages with the old value for ``IN_FLIGHT_S`` seconds after a write."""
+    def set_stale(self, name: str, value: float) -> None:
+        """Ignore messages with the old value for ``STALE_VALUE_S`` seconds after a write."""
         # ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
         # value. An answer with the old value may therefore arrive after the confirmation of the write. But another
-        # station may also have restored the old value. `on_discarded` is therefore called for each ignored message.
-        self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
+        # station may also have restored the old value. The parameter is therefore read after each ignored message.
+        self._stale[name] = StaleValue(value, self._transfers.connection.now() + STALE_VALUE_S)
 
-    def unmark_replaced(self, name: str) -> None:
-        """Undo `mark_replaced` before a new write."""
-        # The new write may set the parameter to the replaced value again.
-        self._replaced.pop(name, None)
+    def clear_stale(self, name: str) -> None:
+        """Undo `set_stale` before a new write, which may set the parameter to the same value again."""
+        self._stale.pop(name, None)
 
-    def replaced_value(self, name: str) -> int | float | None:
+    def stale(self, name: str) -> StaleValue | None:
         """Return the value that is ignored in messages, or None."""
-        if name not in self._replaced:
-            return None
-        value, ignored_until = self._replaced[name]
-        return value if self._transfers.connection.now() < ignored_until else None
+        stale = self._stale.get(name)
+        return stale if stale is not None and self._transfers.connection.now() < stale.ignored_until else None
 
     def attach(self) -> Detach:
         transfers = self._transfers
@@ -97,7 +98,7 @@ class ParameterStore:
         self._forgotten_at = self.updates
         self._known.clear()
         self._last_updates.clear()
-        self._replaced.clear()
+        self._stale.clear()
         self._table = None
         self.is_complete = False
         self.count = None
@@ -134,11 +135,11 @@ class ParameterStore:
         name, old = received.name, self._known.get(received.name)
         if old is None and len(self._known) >= MAX_PARAMETERS:
             return  # A faulty vehicle may send new names without end.
-        replaced_value = self.replaced_value(name)
-        if old is not None and replaced_value is not None and not same_value(received.value, old.value):
+        stale = self.stale(name)
+        if old is not None and stale is not None and not same_value(received.value, old.value):
             # This message is from before the last write, or another station has written the parameter.
-            self._on_discarded(name, self._replaced[name][1])
-            if same_value(received.value, replaced_value):
+            self._read_later(name, stale.ignored_until)
+            if same_value(received.value, stale.value):
                 return
         new = received if old is None else merge_update(old, received, self.bytewise)
         self._known[name] = new
@@ -225,7 +226,8 @@ def vehicle_key(autopilot: str, system_id: int, version: AutopilotVersion | None
 
 def _parameter(row: list[Any], index: int) -> Parameter:
     name, value, type_, default = row
-    if not isinstance(name, str) or not isinstance(value, (int, float)):
-        raise ValueError("the row does not begin with a name and a number")
+    is_default_valid = default is None or isinstance(default, (int, float))
+    if not isinstance(name, str) or not isinstance(value, (int, float)) or not is_default_valid:
+        raise ValueError("the row has no name, no number, or a default that is no number")
     kind = ParameterType(type_)
     return Parameter(name, int(value) if kind.is_integer else float(value), kind, default, index)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
@@ -35,6 +36,9 @@ class RestoreRegistry:
 
     def __init__(self) -> None:
         self._blocks: dict[str, list[_Block]] = {}
+        # Held while a block saves or restores values: a block that begins while another one restores its parameters
+        # would save, and later restore, temporary values.
+        self.lock: asyncio.Lock = asyncio.Lock()
 
     def add(self, name: str, block: _Block) -> None:
         self._blocks.setdefault(name, []).append(block)
@@ -69,6 +73,12 @@ class _Block:
         """Resolve names, and save the parameters as they are before their first write."""
         # The writer calls this method before each round of writes, because some parameters appear only after the first
         # round.
+        async with self._registry.lock:
+            return await self._resolve_and_save_locked(names, idle_timeout_s)
+
+    async def _resolve_and_save_locked(
+        self, names: Iterable[str], idle_timeout_s: float
+    ) -> dict[str, ResolvedParameter | ParameterFailure]:
         results = await self._writer.names.resolve(names, idle_timeout_s)
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
@@ -81,11 +91,7 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # If both values are equal up to rounding, use the stored one, because the answer may lack the last bits of
-            # a float. Otherwise the store is out of date: another station has just undone our write, and the store has
-            # ignored the message about this (`mark_replaced`).
-            known = self._access.store.get(name) or answer
-            current[name] = known if same_value(float(known.value), float(answer.value)) else answer
+            current[name] = self._with_all_bits(answer)
             if name not in self._saved:
                 self._saved[name] = current[name]
                 self._registry.add(name, self)
@@ -93,6 +99,13 @@ class _Block:
             if result.name in current:
                 results[result.requested] = result.replace(parameter=current[result.name])
         return results
+
+    def _with_all_bits(self, answer: Parameter) -> Parameter:
+        """Return the stored parameter if it equals the answer, which may lack the last bits of a number."""
+        # Otherwise the store is out of date: another station has just undone our write, and the store has ignored the
+        # message about this (`set_stale`).
+        known = self._access.store.get(answer.name)
+        return known if known is not None and same_value(float(known.value), float(answer.value)) else answer
 
     def _take_saved(self) -> list[Parameter]:
         """End the block, and return the parameters that it must restore."""
@@ -117,20 +130,24 @@ class _Block:
 
         Raises RollbackFailed for parameters that were not restored.
         """
-        await run_shielded(self._write_previous(self._take_saved(), cause))
+        self._has_ended = True
+        await run_shielded(self._write_previous(cause))
 
-    async def _write_previous(self, saved: list[Parameter], cause: BaseException | None) -> None:
+    async def _write_previous(self, cause: BaseException | None) -> None:
         answers: Mapping[str, object] = {}
         reason = ""
-        with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
-            try:
-                unreadable, changed = await self._unreadable_and_changed(saved)
-                # Keep values that another station has set. Parameters that cannot be read count as not restored.
-                saved = [param for param in saved if param.name not in changed]
-                to_write = [param for param in saved if param.name not in unreadable]
-                answers = await self._access.write(to_write, self._idle_timeout_s)
-            except AerokitError as error:
-                reason = f" ({error})"
+        async with self._registry.lock:
+            saved = self._take_saved()
+            with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
+                try:
+                    names = [param.name for param in saved if self._access.written.get(param.name) is not None]
+                    present = await self._access.read(names, self._idle_timeout_s)
+                    # Keep values that another station has set. Parameters that cannot be read count as not restored.
+                    saved = [param for param in saved if not self._was_changed(param.name, present.get(param.name))]
+                    to_write = [param for param in saved if isinstance(present.get(param.name, param), Parameter)]
+                    answers = await self._access.write(to_write, self._idle_timeout_s)
+                except AerokitError as error:
+                    reason = f" ({error})"
         _raise_not_restored(
             [param for param in saved if not _is_restored(param, answers.get(param.name))], reason, cause
         )
@@ -141,19 +158,14 @@ class _Block:
             raise error
         _raise_not_restored(self._take_saved(), f" ({error})", cause)
 
-    async def _unreadable_and_changed(self, saved: list[Parameter]) -> tuple[set[str], set[str]]:
-        """Return the names that cannot be read, and those that another station has changed."""
-        written = self._access.written
-        names = [param.name for param in saved if param.name in written]
-        unreadable, changed = set[str](), set[str]()
-        for name, answer in (await self._access.read(names, self._idle_timeout_s)).items():
-            if not isinstance(answer, Parameter):
-                unreadable.add(name)
-            elif float(answer.value) != float(written[name]):
-                changed.add(name)
-                text = "%s is not restored: another station has changed it from %r to %r"
-                logger.warning(text, name, written[name], answer.value)
-        return unreadable, changed
+    def _was_changed(self, name: str, present: object) -> bool:
+        """Return True, and log a warning, if another station has changed the parameter."""
+        written = self._access.written.get(name)  # None if another task of this program is writing the parameter
+        if not isinstance(present, Parameter) or written is None or float(present.value) == float(written):
+            return False
+        text = "%s is not restored: another station has changed it from %r to %r"
+        logger.warning(text, name, written, present.value)
+        return True
 
 
 class TemporaryParameters(_Block):

@@ -74,14 +74,13 @@ class NameResolver:
         self, names: Iterable[str], idle_timeout_s: float
     ) -> dict[str, ResolvedParameter | ParameterFailure]:
         """Resolve names, reading parameters that are unknown. Warns of renamed parameters."""
-        normalized_names = {check_name(name): self._normalized(name) for name in names}
+        normalized = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
-        names = normalized_names.values()
-        answers = await self._access.read(self._names_in_doubt(names), idle_timeout_s)
+        answers = await self._access.read(self._names_in_doubt(normalized.values()), idle_timeout_s)
         # A reboot while names are read clears the store, and then further names are unknown.
-        while to_read := [name for name in self._unknown_names(names) if name not in answers]:
+        while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:
             answers |= await self._access.read(to_read, idle_timeout_s, probe=True)
-        for requested, name in normalized_names.items():
+        for requested, name in normalized.items():
             result = self._resolve_one(name, answers)
             if isinstance(result, ResolvedParameter):
                 result = result.replace(requested=requested)
@@ -309,7 +308,7 @@ class ParameterWriter:
         # Two names may mean the same parameter, which must be in the file only once.
         changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}.values()
         unchanged: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_unchanged}
-        return unchanged | await self._access.write_pack(changed, upload, idle_timeout_s, on_progress)
+        return unchanged | await self._access.write_file(changed, upload, idle_timeout_s, on_progress)
 
     def _plan_writes(
         self,

@@ -68,6 +68,9 @@ class CommandSender:
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
+        # The time of the last refusal of a call. The time and the MAV_RESULT of the last refusal for which none waited.
+        self._refused_at: dict[_Key, float] = {}
+        self._late_refusals: dict[_Key, tuple[float, int]] = {}
         self._is_closed = False
         self._detach_callbacks = (
             connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
@@ -163,6 +166,10 @@ class CommandSender:
         # An ack without a target (0) counts too. MAVLink 1 and old firmware send no target.
         return is_addressed_to(ack, self._connection.source_system, self._connection.source_component)
 
+    def _is_for_our_ids(self, ack: CommandAck) -> bool:
+        # An ack without a target (0) may be for another ground station.
+        return self.is_for_us(ack) and ack.target_system == self._connection.source_system
+
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
@@ -178,6 +185,14 @@ class CommandSender:
     def accepted_at(self, command: int) -> float:
         """Return the time of the autopilot's last ACCEPTED ack to us, or −inf if there was none."""
         return self._accepted_at.get((self._component_id, command), -math.inf)
+
+    def late_refusal(self, command: int, component_id: int, since: float) -> int | None:
+        """Return the MAV_RESULT of a refusal after ``since`` for which no call waited; None if there was none.
+
+        The ack that a call took for its own was then the late or repeated ack of an earlier command.
+        """
+        received_at, result = self._late_refusals.get((component_id, command), (-math.inf, None))
+        return result if received_at >= since else None
 
     def forget_result(self, command: int, component_id: int | None = None) -> None:
         key = (self._component_id if component_id is None else component_id, command)
@@ -291,9 +306,10 @@ class CommandSender:
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and is_final:
             self._results[key] = ack.result
-            # An ack without a target may be for another ground station, so `accepted_at` ignores it.
-            if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
+            if ack.result == MavResult.ACCEPTED and self._is_for_our_ids(ack):
                 self._accepted_at[key] = self._connection.now()
+            if ack.result != MavResult.ACCEPTED:
+                self._refused_at[key] = self._connection.now()
         if run is not None:
             run.receive(ack)
         elif is_answer and is_final:
@@ -301,3 +317,9 @@ class CommandSender:
             self._pending_acks[key].pop(0)
             if not self._pending_acks[key]:
                 del self._pending_acks[key]
+        elif is_final and ack.result != MavResult.ACCEPTED and key in self._results and self._is_for_our_ids(ack):
+            now = self._connection.now()
+            # After another refusal, this may be a copy of it.
+            if now - self._refused_at.get(key, -math.inf) > PENDING_ACK_TIMEOUT_S:
+                self._results[key] = ack.result
+                self._late_refusals[key] = now, ack.result

@@ -29,7 +29,7 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
     """Send SETUP_SIGNING until the vehicle signs with the key, or no longer signs."""
     _check_vehicle(session)
     connection, started = session.connection, session.connection.now()
-    with connection._gate.key_handover(signing, session.system_id, session.component_id) as has_accepted:
+    with connection._signatures.key_handover(signing, session.system_id, session.component_id) as has_accepted:
         with anyio.move_on_after(timeout):
             while not has_accepted.is_set():
                 session.send(_message(session, signing))

@@ -329,3 +329,12 @@ def height_above_home(telemetry: Telemetry) -> float | None:
     """Return the reported height above home in metres, or None if it is unknown."""
     here = telemetry.position.latest
     return None if here is None else here.altitude_relative_m
+
+
+def altitude_amsl(telemetry: Telemetry) -> float | None:
+    """Return the reported altitude above mean sea level in metres, or None if it is unknown.
+
+    Changes of height are measured by this altitude, because PX4 corrects the altitude of home in flight.
+    """
+    here = telemetry.position.latest
+    return None if here is None else here.altitude_amsl_m

@@ -1,4 +1,4 @@
-"""Routes and their claims without a connection, exact to the frame and the millisecond."""
+"""Routes, and peers that want them, without a connection, exact to the frame and the millisecond."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from test_routes import COPTER, PeersLink
 
 from aerokit import events
 from aerokit.connection import routes as routes_module
-from aerokit.connection.routes import Evidence, RouteClaim, Routes, boot_time_ms
+from aerokit.connection.routes import OtherPeer, Routes, boot_time_ms
 from aerokit.mavlink import Frame, Framer
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
@@ -58,10 +58,10 @@ class Stage:
     def next_number(self) -> int:
         return self.copter.encoder.sequence
 
-    def claims(self, at: float, ahead: int, peer: str = OTHER_HOST, **kind: Any) -> bool:
-        frame, counters = Sender(1, self.next_number + ahead).send(at, **kind)
+    def moves(self, at: float, ahead: int, peer: str = OTHER_HOST, **kind: Any) -> bool:
+        frame, _ = Sender(1, self.next_number + ahead).send(at, **kind)
         assert self.routes.arrived_on_other_peer(frame, peer)
-        return self.routes.claims_route(frame, peer, counters, is_signed=False)
+        return self.routes.try_move_route(frame, peer, is_signed=False)
 
     def _at_home(self, at: float) -> tuple[Frame, str, SourceStatistics]:
         frame, counters = self.copter.send(at)
@@ -76,7 +76,7 @@ def names(reported: list[events.Event]) -> list[str]:
 def test_after_silence_numbers_may_be_ahead_by_lost_frames(ahead: int, takes: bool) -> None:
     """8 + 1.5 · 10 Hz · 4 s."""
     stage = Stage()
-    assert stage.claims(5.0, ahead) is takes
+    assert stage.moves(5.0, ahead) is takes
     assert names(stage.reported) == (["RouteChanged"] if takes else ["DuplicateSender", "RouteChangeRefused"])
 
 
@@ -84,18 +84,18 @@ def test_after_silence_numbers_may_be_ahead_by_lost_frames(ahead: int, takes: bo
 def test_without_silence_numbers_may_be_slightly_ahead(ahead: int, reported: list[str]) -> None:
     """The limit is 8 + 1.5 · 10 Hz · 0.1 s. On the same host, no event is published while it may be the vehicle."""
     stage = Stage()
-    assert not stage.claims(1.1, ahead, SAME_HOST)
+    assert not stage.moves(1.1, ahead, SAME_HOST)
     assert names(stage.reported) == reported
 
 
 @pytest.mark.parametrize(("after_s", "takes"), [(ROUTE_TIMEOUT_S, False), (ROUTE_TIMEOUT_S + 0.01, True)])
 def test_route_times_out_after_three_and_a_half_seconds(after_s: float, takes: bool) -> None:
-    assert Stage().claims(1.0 + after_s, 0) is takes
+    assert Stage().moves(1.0 + after_s, 0) is takes
 
 
 def test_clock_decides_where_numbers_are_ambiguous() -> None:
     """After 8 s at 10 Hz the counter may have wrapped around."""
-    assert not Stage().claims(9.1, 0)  # and there is no clock
+    assert not Stage().moves(9.1, 0)  # and there is no clock
     clocks = {(1, 1): lambda at: 1000 * at}
     for boot_ms, takes in (
         (9000 + 1900, True),
@@ -103,14 +103,14 @@ def test_clock_decides_where_numbers_are_ambiguous() -> None:
         (9000 - 1900, True),
         (9000 - 1901, False),
     ):
-        assert Stage(boot_clocks=clocks).claims(9.0, -100, message=attitude(boot_ms)) is takes
+        assert Stage(boot_clocks=clocks).moves(9.0, -100, message=attitude(boot_ms)) is takes
 
 
 @pytest.mark.parametrize(("right", "takes"), [(True, True), (False, False)])
 def test_known_clock_must_be_confirmed(right: bool, takes: bool) -> None:
     stage = Stage(boot_clocks={(1, 1): lambda at: 1000 * at})
-    assert not stage.claims(5.0, 0)  # the heartbeat has no time
-    assert stage.claims(5.1, 1, message=attitude(5100 if right else 99_000)) is takes
+    assert not stage.moves(5.0, 0)  # the heartbeat has no time
+    assert stage.moves(5.1, 1, message=attitude(5100 if right else 99_000)) is takes
 
 
 def test_rate_ignores_interval_without_counters() -> None:
@@ -124,10 +124,10 @@ def test_rate_ignores_interval_without_counters() -> None:
 
 
 def test_system_without_vehicle_object_is_taken_after_silence() -> None:
-    assert Stage(attached=set()).claims(5.0, -100)
-    assert not Stage(attached=set()).claims(2.0, -100)
-    assert Stage(may_move=True).claims(5.0, -100)
-    assert Stage().claims(5.0, -100, SAME_HOST)
+    assert Stage(attached=set()).moves(5.0, -100)
+    assert not Stage(attached=set()).moves(2.0, -100)
+    assert Stage(may_move=True).moves(5.0, -100)
+    assert Stage().moves(5.0, -100, SAME_HOST)
 
 
 def test_other_port_takes_route_with_three_frames_in_time() -> None:
@@ -135,8 +135,8 @@ def test_other_port_takes_route_with_three_frames_in_time() -> None:
     other.encoder.sequence = stage.next_number
     takes = []
     for at in (1.1, 1.2, 1.3, 1.41):
-        frame, counters = other.send(at)
-        takes.append(stage.routes.claims_route(frame, SAME_HOST, counters, is_signed=False))
+        frame, _ = other.send(at)
+        takes.append(stage.routes.try_move_route(frame, SAME_HOST, is_signed=False))
     assert takes == [False, False, False, True]
     assert names(stage.reported) == ["RouteChanged"]
     assert stage.routes.peers_of(1, 1) == (SAME_HOST,)
@@ -145,13 +145,13 @@ def test_other_port_takes_route_with_three_frames_in_time() -> None:
     assert moved.at == pytest.approx(1.41)
 
 
-def test_claims_are_reported_again_after_owner_returns() -> None:
+def test_other_peers_are_reported_again_after_owner_returns() -> None:
     stage = Stage()
     for at in (5.0, 5.1):
-        assert not stage.claims(at, 100)
+        assert not stage.moves(at, 100)
     assert names(stage.reported) == ["DuplicateSender", "RouteChangeRefused"]
     stage.routes.record_heartbeat(*stage._at_home(5.2))
-    assert not stage.claims(10.0, 100)
+    assert not stage.moves(10.0, 100)
     assert names(stage.reported) == ["DuplicateSender", "RouteChangeRefused", "RouteChangeRefused"]
 
 
@@ -206,37 +206,38 @@ def test_full_table_is_swept_once_a_second(monkeypatch: pytest.MonkeyPatch) -> N
     assert routes.record_heartbeat(Sender(2).send(31.5)[0], OTHER_HOST, None)
 
 
-# ------------------------------------------------------------------------------------- claims
+# ------------------------------------------------------------------------------------- other peers
 
 
-def test_claim_is_judged_by_first_frame_after_owner() -> None:
-    claim, (frame, _) = RouteClaim(), Sender().send(1.0)
-    assert (claim.continues_owner, claim.may_continue_owner) == (False, True)
-    claim.add(frame, Evidence(10, False, True))
-    claim.add(frame, Evidence(10, True, True))
-    assert (claim.continues_owner, claim.may_continue_owner) == (False, False)
-    claim.is_refusal_reported = True
-    claim.add(frame, Evidence(11, True, None))
-    assert (claim.continues_owner, claim.may_continue_owner, claim.is_refusal_reported) == (
-        False,
-        True,
-        False,
-    )
-    claim.add(frame, Evidence(11, True, True))
-    assert claim.continues_owner
-    claim.add(frame, Evidence(11, True, False))
-    claim.add(frame, Evidence(11, True, True))
-    assert (claim.continues_owner, claim.may_continue_owner) == (False, False)
+def test_other_peer_is_judged_by_first_frame_after_owner() -> None:
+    other, (frame, _) = OtherPeer(), Sender().send(1.0)
+
+    def is_same_sender() -> bool | None:
+        return other.is_same_sender
+
+    assert is_same_sender() is None
+    other.add(frame, 10, False, True)
+    other.add(frame, 10, True, True)
+    assert is_same_sender() is False
+    other.is_refusal_reported = True
+    other.add(frame, 11, True, None)
+    assert is_same_sender() is None
+    assert not other.is_refusal_reported
+    other.add(frame, 11, True, True)
+    assert is_same_sender() is True
+    other.add(frame, 11, True, False)
+    other.add(frame, 11, True, True)
+    assert is_same_sender() is False
 
 
-def test_claim_needs_three_frames_in_the_time_of_three() -> None:
-    claim, (frame, _) = RouteClaim(), Sender().send(1.0)
+def test_other_peer_needs_three_frames_in_the_time_of_three() -> None:
+    other, (frame, _) = OtherPeer(), Sender().send(1.0)
     for frames in (1, 2, 3):
-        claim.add(frame, Evidence(10, True, True))
-        assert claim.has_replaced(9.0, 10.0) is (frames == 3)
-    assert not claim.has_replaced(1.29, 10.0)
-    assert claim.has_replaced(1.5, 6.0)
-    assert not claim.has_replaced(9.0, 0.0)
+        other.add(frame, 10, True, True)
+        assert other.has_replaced_owner(9.0, 10.0) is (frames == 3)
+    assert not other.has_replaced_owner(1.29, 10.0)
+    assert other.has_replaced_owner(1.5, 6.0)
+    assert not other.has_replaced_owner(9.0, 0.0)
 
 
 def test_boot_time_of_a_frame() -> None:
