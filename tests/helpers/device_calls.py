@@ -53,7 +53,7 @@ class DeviceCall(NamedTuple):
 
     @property
     def order(self) -> str:
-        """Name in docs/reliability.md: ``"gripper.grab"`` for ``"Gripper.grab"``."""
+        """Name in the table of orders: ``"gripper.grab"`` for ``"Gripper.grab"``."""
         name = self.name.removeprefix("Vehicle.")
         return name[0].lower() + name[1:]
 
@@ -176,7 +176,7 @@ DEVICE_CALLS = (
         wrong=lambda v: _fail(v, instance=17),
     ),
 )
-"""Orders that end with an effect or an acknowledgement of the autopilot, in docs/reliability.md."""
+"""Orders that end with an effect or an acknowledgement of the autopilot."""
 
 
 # -------------------------------------------------------------- devices that are components

@@ -199,17 +199,7 @@ bauds = st.none() | st.integers(1, 4_000_000)
 
 @st.composite
 def addresses(draw: st.DrawFn) -> LinkAddress:
-    kinds: list[LinkKind] = [
-        "udpin",
-        "udpout",
-        "udpbcast",
-        "tcp",
-        "tcpin",
-        "serial",
-        "replay",
-        "zenoh",
-        "zenohin",
-    ]
+    kinds: list[LinkKind] = ["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "zenoh", "zenohin"]
     kind = draw(st.sampled_from(kinds))
     if kind in ("zenoh", "zenohin"):
         path = draw(

@@ -27,19 +27,6 @@ from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavSta
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
-NOT_ON_ARDUPILOT = frozenset(
-    {
-        MavCmd.DO_SET_ACTUATOR,
-        MavCmd.ACTUATOR_TEST,
-        MavCmd.INJECT_FAILURE,
-        MavCmd.ILLUMINATOR_ON_OFF,
-        MavCmd.LOGGING_START,
-    }
-)
-NOT_ON_PLANE = NOT_ON_ARDUPILOT | {MavCmd.DO_WINCH}
-NOT_ON_COPTER = NOT_ON_ARDUPILOT | {MavCmd.DO_VTOL_TRANSITION}
-NOT_ON_GROUND_OR_WATER = NOT_ON_PLANE | NOT_ON_COPTER | {MavCmd.DO_PARACHUTE, MavCmd.AIRFRAME_CONFIGURATION}
-
 COPTER = ModeTable(
     {
         0: "STABILIZE",
@@ -215,7 +202,6 @@ class ArduPilot(Autopilot):
         }
     )
     highres_imu_field_ut: float = 1e-4
-    unsupported_commands: frozenset[int] = NOT_ON_ARDUPILOT
     reports_gripper_by_text = True
     winch_actions: frozenset[int] = frozenset((0, 1, 2))
 
@@ -244,8 +230,8 @@ class ArduCopter(ArduPilot):
     """ArduCopter: multicopters and helicopters."""
 
     firmware = "ArduCopter"
+    has_vtols = False
     mission_needs_take_off = True  # ModeAuto::init refuses the mission with "Auto: Missing Takeoff Cmd".
-    unsupported_commands: frozenset[int] = NOT_ON_COPTER
     modes: ModeTable = COPTER
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies.
@@ -308,7 +294,6 @@ class ArduPlane(ArduPilot):
     """ArduPlane: planes, and VTOL planes, which ArduPilot calls QuadPlanes."""
 
     firmware = "ArduPlane"
-    unsupported_commands: frozenset[int] = NOT_ON_PLANE
     modes: ModeTable = PLANE
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
@@ -362,7 +347,7 @@ class ArduRover(ArduPilot):
     """ArduRover: rovers and boats."""
 
     firmware = "Rover"
-    unsupported_commands: frozenset[int] = NOT_ON_GROUND_OR_WATER
+    has_vtols = False
     is_surface_vehicle = True
     modes: ModeTable = ROVER
     purposes: ClassVar[Mapping[str, str]] = {
@@ -390,7 +375,7 @@ class ArduSub(ArduPilot):
     """ArduSub: remotely operated and autonomous underwater vehicles."""
 
     firmware = "ArduSub"
-    unsupported_commands: frozenset[int] = NOT_ON_GROUND_OR_WATER
+    has_vtols = False
     modes: ModeTable = SUB
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "POSHOLD",

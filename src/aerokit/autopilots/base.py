@@ -484,8 +484,8 @@ class Autopilot:
     unknown.
     """
 
-    unsupported_commands: frozenset[int] = frozenset()
-    """MAV_CMDs that the firmware does not handle. Actions that need such a command raise NotSupported at once."""
+    has_vtols: bool = True
+    """False if EXTENDED_SYS_STATE may report a VTOL state although no vehicle of the firmware is a VTOL."""
     reports_gripper_by_text: bool = False
     """True if a status text reports the end of a gripper's movement, False if the acknowledgement reports it."""
     highres_imu_field_ut: float = 100.0

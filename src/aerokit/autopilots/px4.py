@@ -166,20 +166,6 @@ class Px4(Autopilot):
     )
 
     has_shell = True
-    # PX4's MAVLink module passes DO_WINCH on, but no other module handles it.
-    unsupported_commands: frozenset[int] = frozenset(
-        {
-            MavCmd.DO_SET_SERVO,
-            MavCmd.DO_REPEAT_SERVO,
-            MavCmd.DO_SET_RELAY,
-            MavCmd.DO_REPEAT_RELAY,
-            MavCmd.DO_MOTOR_TEST,
-            MavCmd.DO_PARACHUTE,
-            MavCmd.AIRFRAME_CONFIGURATION,
-            MavCmd.DO_WINCH,
-            MavCmd.ILLUMINATOR_ON_OFF,
-        }
-    )
 
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)

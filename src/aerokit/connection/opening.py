@@ -17,6 +17,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent, MavType
 from aerokit.transport import ReconnectingLink, create_link
+from aerokit.transport.create import FILTERING_KINDS
 from aerokit.transport.link import Link
 
 if TYPE_CHECKING:
@@ -38,8 +39,6 @@ ground station with that id has gone.
 """
 
 
-# Kinds of links that filter their senders by ``peers``.
-FILTERING_KINDS = ("udpin", "udpbcast", "tcpin")
 PEERS_WITH_LINK_OBJECT = (
     "peers = … is not allowed with a link object: pass an address, or pass them to UdpListen or TcpListen"
 )

@@ -64,18 +64,19 @@ class SimParameters:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
         # Maps the name of a parameter to the name of the parameter that enables it.
         self._switches = {row.name: row.switch for row in self._all_rows() if row.switch is not None}
+        self._unlisted: frozenset[str] = frozenset()  # names beyond the number of parameters to list
         self._names: tuple[str, ...] | None = None  # None if they must be computed at the next access
         self._indices: dict[str, int] = {}
 
     @classmethod
-    def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> SimParameters:
+    def from_text(cls, text: str, count: int | None = None) -> SimParameters:
         """Parse lines of ``name,type,value[,default[,switch]]``.
 
         The switch is the name of the parameter that enables this one, or ``v`` for a volatile parameter. ``count`` is
-        the number of parameters to keep. The parameters in ``used`` are always kept.
+        the number of parameters to list. The others can only be read and set by name.
         """
         parameters = cls(())
-        lines, switches = _lines_and_switches(text, frozenset(used), count)
+        lines, switches, parameters._unlisted = _lines_and_switches(text, count)
         parameters._rows = dict(lines)
         parameters._switches = dict(switches)
         return parameters
@@ -120,15 +121,15 @@ class SimParameters:
     def names(self) -> tuple[str, ...]:
         """Names of the listed (not hidden) parameters, in order. The position of a name is its ``param_index``."""
         if self._names is None:
-            hidden = {name for name, switch in self._switches.items() if not self[switch]}
+            hidden = self._unlisted.union(name for name, switch in self._switches.items() if not self[switch])
             self._names = tuple(name for name in self._rows if name not in hidden)
             self._indices = {name: index for index, name in enumerate(self._names)}
         return self._names
 
     def index(self, name: str) -> int:
-        """Return the position of a name in ``names``."""
+        """Return the position of a name in ``names``, or 65535 if it is hidden."""
         _ = self.names  # Reading the property updates `_indices`.
-        return self._indices[name]
+        return self._indices.get(name, 0xFFFF)
 
     def type(self, name: str) -> int:
         return self.row(name).type
@@ -185,27 +186,16 @@ def _switch_of(line: str) -> str | None:
 
 @functools.lru_cache(maxsize=16)  # A test may create thousands of vehicles with the same table.
 def _lines_and_switches(
-    text: str, used: frozenset[str], count: int | None
-) -> tuple[dict[str, SimParameter | str], dict[str, str]]:
-    """Return the selected lines and their switches (see `SimParameter`), both by parameter name."""
-    selected = text.split() if count is None else _select_lines(text.split(), used, count)
-    lines: dict[str, SimParameter | str] = {line.partition(",")[0]: line for line in selected}
-    switches = {name: _switch_of(str(line)) for name, line in lines.items()}
-    return lines, {name: switch for name, switch in switches.items() if switch is not None}
-
-
-def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return the lines of the parameters in ``used``, and other lines to reach ``count`` lines."""
-    is_used = [line.partition(",")[0] in used for line in lines]
-    others_left = max(0, count - sum(is_used))
-    selected: list[str] = []
-    for line, is_line_used in zip(lines, is_used, strict=True):
-        if is_line_used:
-            selected.append(line)
-        elif others_left > 0 and _switch_of(line) is None:
-            selected.append(line)
-            others_left -= 1
-    return selected
+    text: str, count: int | None
+) -> tuple[dict[str, SimParameter | str], dict[str, str], frozenset[str]]:
+    """Return the lines and their switches (see `SimParameter`), both by name, and the names that are not listed."""
+    lines: dict[str, SimParameter | str] = {line.partition(",")[0]: line for line in text.split()}
+    all_switches = {name: _switch_of(str(line)) for name, line in lines.items()}
+    switches = {name: switch for name, switch in all_switches.items() if switch is not None}
+    if count is None:
+        return lines, switches, frozenset()
+    listed = [name for name in lines if name not in switches][:count]
+    return lines, {}, frozenset(lines).difference(listed)
 
 
 _NAME = "param.pck"

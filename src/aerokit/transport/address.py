@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from aerokit._internal.formatting import did_you_mean
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"]
 
@@ -47,8 +50,7 @@ class LinkAddress(Snapshot):
     """
 
     def __str__(self) -> str:
-        encode_value = _quote_option if self.kind in _ZENOH_KINDS else str
-        query = "&".join(f"{key}={encode_value(value)}" for key, value in self.options)
+        query = "&".join(f"{key}={_quote_option(value)}" for key, value in self.options)
         return self._without_options() + (f"?{query}" if query else "")
 
     def option(self, name: str) -> str | None:
@@ -66,7 +68,7 @@ class LinkAddress(Snapshot):
             return f"replay:{slashes}{_quote(self.path)}"
         if self.kind == "pty":
             return f"pty:{self.path}" if self.path else "pty"
-        if self.kind in _ZENOH_KINDS:
+        if self.kind in ("zenoh", "zenohin"):
             return f"{self.kind}://{self.path}"
         return f"{self.kind}:{host_and_port(self.host, self.port)}"
 
@@ -87,34 +89,7 @@ def host_and_port(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-_SCHEMES: dict[str, LinkKind] = {
-    "udp": "udpin",
-    "udpin": "udpin",
-    "udpout": "udpout",
-    "udpbcast": "udpbcast",
-    "tcp": "tcp",
-    "tcpout": "tcp",
-    "tcpin": "tcpin",
-    "serial": "serial",
-    "replay": "replay",
-    "file": "replay",
-    "zenoh": "zenoh",
-    "zenohin": "zenohin",
-}
-
-_OPTIONS: dict[LinkKind, tuple[str, ...]] = {
-    "tcp": ("timeout",),
-    "serial": ("baud", "rtscts"),
-    "replay": ("speed",),
-    "zenoh": ("connect", "listen", "mode", "config", "client", "control", "timeout"),
-    "zenohin": ("connect", "listen", "mode", "config"),
-}
-
-_LISTENING = ("udpin", "tcpin")
-
-_NEVER_COSTLY = ("replay", "pty")
-
-_ZENOH_KINDS = ("zenoh", "zenohin")
+Options = dict[str, str]
 
 _CHOICES = {"mode": ("peer", "client"), "control": ("free", "take", "never")}
 
@@ -190,36 +165,31 @@ class _Parser:
     def parse_with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
         kind = _SCHEMES[scheme]
         target, _, query = after_scheme.partition("?")
-        options = self.parse_options(kind, query)
-        if kind == "serial":
-            return self.parse_serial(target, options, has_scheme=True)
-        if kind == "replay":
-            if scheme == "file" and re.match(r"/[a-z]:[/\\]", target, re.IGNORECASE):
-                target = target[1:]  # In file:///C:/…, the slash before a Windows drive is not part of the path.
-            return self.parse_replay(_unquote(target), options)
-        if kind in _ZENOH_KINDS:
-            return self.parse_zenoh(kind, target.removesuffix("/"), options)
-        return self.parse_network(kind, target.removesuffix("/"), options)
+        if scheme == "file" and re.match(r"/[a-z]:[/\\]", target, re.IGNORECASE):
+            target = target[1:]  # In file:///C:/…, the slash before a Windows drive is not part of the path.
+        return _KINDS[kind].parse(self, kind, target, self.parse_options(kind, query))
 
     def parse_bare(self, text: str) -> LinkAddress:
         """Parse a recording, a serial port, or host:port to listen on."""
         if _RECORDING.fullmatch(text):
             end = text.lower().rindex(".tlog") + len(".tlog")
-            return self.parse_replay(text[:end], self.parse_options("replay", text[end + 1 :]))
+            options = self.parse_options("replay", text[end + 1 :])
+            return self.parse_replay("replay", text[:end], options, has_scheme=False)
         if _DATAFLASH.fullmatch(text):
             raise self.error("this is a log in the autopilot's own format, not a MAVLink recording (.tlog)")
         if match := _WITHOUT_COLON.match(text):
             raise self.missing_colon_error(match[1].lower(), match[0], text)
         if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
-            return self.parse_serial(text, {}, has_scheme=False)
+            return self.parse_serial("serial", text, {}, has_scheme=False)
         if ":" not in text:
             raise self.error("it is neither host:port nor the path of a serial port or of a .tlog file")
         if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
             raise self.scheme_error(text.partition(":")[0])  # e.g. "upd:127.0.0.1:14550"
         return self.parse_network("udpin", text, {})
 
-    def parse_network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+    def parse_network(self, kind: LinkKind, text: str, options: Options) -> LinkAddress:
         """Parse ``host:port``."""
+        text = text.removesuffix("/")
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
@@ -233,7 +203,7 @@ class _Parser:
                 raise self.error("an IPv6 address needs brackets, as in [::1]:14550")
             if text.isdigit():  # The text is only a port, e.g. in "udpin:14550".
                 raise self.error(f"the host is missing; write {kind}:127.0.0.1:{text}")
-        if not host and kind in _LISTENING:
+        if not host and _KINDS[kind].listens:
             host = "0.0.0.0"
         if not host:
             raise self.error("the host is missing")
@@ -243,7 +213,7 @@ class _Parser:
             raise self.error(f"{host!r} is not a host")
         return LinkAddress(kind, host=host, port=self.parse_port(kind, tail), options=tuple(sorted(options.items())))
 
-    def parse_zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+    def parse_zenoh(self, kind: LinkKind, text: str, options: Options) -> LinkAddress:
         """Parse ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
@@ -251,7 +221,7 @@ class _Parser:
             for endpoint in filter(None, options.get(key, "").split(",")):
                 if not _ENDPOINT.fullmatch(endpoint):
                     raise self.error(f"{key}={endpoint} is not a zenoh endpoint such as tcp/10.0.0.5:7447")
-        fleet, slash, name = text.partition("/")
+        fleet, slash, name = text.removesuffix("/").partition("/")
         if not slash:
             raise self.error(f"the name of the vehicle is missing; write it as in {kind}://fleet/alpha")
         try:
@@ -270,12 +240,12 @@ class _Parser:
         if not tail.startswith(":"):
             raise self.error(f"expected :port after the host, got {tail!r}")
         port = self.parse_whole_number("the port", tail[1:])
-        min_port = 0 if kind in _LISTENING else 1
+        min_port = 0 if _KINDS[kind].listens else 1
         if not min_port <= port <= 65535:
             raise self.error(f"the port {port} is out of range ({min_port} to 65535)")
         return port
 
-    def parse_serial(self, text: str, options: dict[str, str], *, has_scheme: bool) -> LinkAddress:
+    def parse_serial(self, kind: LinkKind, text: str, options: Options, *, has_scheme: bool = True) -> LinkAddress:
         # In an address without a scheme, only the name of a COM port may be followed by a colon and the baud rate.
         # Other names may contain colons themselves.
         colon_baud = _COLON_BAUD if has_scheme else _COM_COLON_BAUD
@@ -293,18 +263,17 @@ class _Parser:
         baud = None if baud_text is None else self.parse_whole_number("the baud rate", baud_text)
         if baud == 0:
             raise self.error("the baud rate is 0")
-        return LinkAddress("serial", device=device, baud=baud, options=tuple(sorted(options.items())))
+        return LinkAddress(kind, device=device, baud=baud, options=tuple(sorted(options.items())))
 
-    def parse_replay(self, path: str, options: dict[str, str]) -> LinkAddress:
+    def parse_replay(self, kind: LinkKind, path: str, options: Options, *, has_scheme: bool = True) -> LinkAddress:
+        path = _unquote(path) if has_scheme else path
         if not path.strip():
             raise self.error("the path of the recording is missing")
-        return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
+        return LinkAddress(kind, path=path, options=tuple(sorted(options.items())))
 
-    def parse_options(self, kind: LinkKind, query: str) -> dict[str, str]:
-        options: dict[str, str] = {}
-        allowed = _OPTIONS.get(kind, ())
-        if kind not in _NEVER_COSTLY:
-            allowed = (*allowed, "costly")
+    def parse_options(self, kind: LinkKind, query: str) -> Options:
+        options: Options = {}
+        allowed = _KINDS[kind].options
         for assignment in filter(None, query.split("&")):
             key, _, value = assignment.partition("=")
             key = key.strip().lower()
@@ -393,3 +362,28 @@ def _quote_device(device: str) -> str:
     """Like `_quote`, but also encode what separates a baud rate."""
     # A comma, or a colon before digits at the end, separates a baud rate.
     return re.sub(r":(?=[0-9]+$)", "%3A", _quote(device).replace(",", "%2C"))
+
+
+class _Kind(NamedTuple):
+    """How the addresses of one kind of link are parsed."""
+
+    schemes: tuple[str, ...]
+    parse: Callable[[_Parser, LinkKind, str, Options], LinkAddress]
+    """Parses what follows the scheme, without the options."""
+    options: tuple[str, ...] = ("costly",)
+    listens: bool = False
+
+
+_NETWORK = ("connect", "listen", "mode", "config")
+_KINDS: dict[LinkKind, _Kind] = {
+    "udpin": _Kind(("udp", "udpin"), _Parser.parse_network, listens=True),
+    "udpout": _Kind(("udpout",), _Parser.parse_network),
+    "udpbcast": _Kind(("udpbcast",), _Parser.parse_network),
+    "tcp": _Kind(("tcp", "tcpout"), _Parser.parse_network, ("timeout", "costly")),
+    "tcpin": _Kind(("tcpin",), _Parser.parse_network, listens=True),
+    "serial": _Kind(("serial",), _Parser.parse_serial, ("baud", "rtscts", "costly")),
+    "replay": _Kind(("replay", "file"), _Parser.parse_replay, ("speed",)),
+    "zenoh": _Kind(("zenoh",), _Parser.parse_zenoh, (*_NETWORK, "client", "control", "timeout", "costly")),
+    "zenohin": _Kind(("zenohin",), _Parser.parse_zenoh, (*_NETWORK, "costly")),
+}
+_SCHEMES = {scheme: kind for kind, row in _KINDS.items() for scheme in row.schemes}

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from aerokit.transport.sockets import PeerFilter
     from aerokit.transport.zenoh.session import NetworkOptions
 
+FILTERING_KINDS = ("udpin", "udpbcast", "tcpin")
+"""Kinds of links that filter their senders by ``peers``."""
+
 
 def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFilter | None = None) -> Link:
     """Create the link that a connection string describes. The link is not opened.
@@ -25,7 +28,7 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
         InvalidArgument: the address or ``peers`` are wrong.
     """
     parsed = address if isinstance(address, LinkAddress) else parse_address(address)
-    if peers is not None and parsed.kind not in ("udpin", "udpbcast", "tcpin"):
+    if peers is not None and parsed.kind not in FILTERING_KINDS:
         raise InvalidArgument(
             f"peers = … is not allowed with {parsed}: only udpin, udpbcast and tcpin links filter senders"
         )

@@ -351,7 +351,7 @@ async def test_block_exit_unsubscribes() -> None:
 
 
 async def test_read_returns_one_parameter() -> None:
-    async with open_flight(copter()) as flight:
+    async with open_flight(copter(None)) as flight:
         parameters = flight.vehicle.parameters
         assert await parameters.get("RTL_ALT") == 1500
         assert isinstance(await parameters.get("RTL_ALT"), int)
@@ -766,7 +766,7 @@ async def test_doubtful_parameter_raises_the_parameter_rate() -> None:
 
 
 async def test_renamed_parameters_in_files_and_blocks() -> None:
-    simulated = copter()
+    simulated = copter(None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ParameterRenamedWarning)
         async with open_flight(simulated) as flight:
@@ -869,11 +869,11 @@ async def test_changed_hash_invalidates_the_cache(tmp_path: Path) -> None:
     simulated = px4()
     async with open_px4(simulated) as flight:
         await flight.vehicle.parameters.download(cache=tmp_path)
-        simulated.parameters["COM_RC_IN_MODE"] = 4
+        simulated.parameters["ATT_EN"] = 1
         flight.vehicle.parameters._access.forget()
         flight.wire.clear()
         table = await flight.vehicle.parameters.download(cache=tmp_path)
-        assert table["COM_RC_IN_MODE"].value == 4
+        assert table["ATT_EN"].value == 1
         assert len(flight.wire.all(messages.ParamRequestList)) == 1
         flight.vehicle.parameters._access.forget()
         flight.wire.clear()

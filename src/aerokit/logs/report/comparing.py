@@ -17,7 +17,7 @@ from aerokit.logs.report.charts import (
 )
 from aerokit.logs.report.page import Chart, Paragraphs, Section, Table
 from aerokit.logs.report.sections import failsafe_section, mode_table
-from aerokit.logs.report.statistics import metres_from_home
+from aerokit.logs.report.statistics import STATISTICS, metres_from_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -29,30 +29,6 @@ if TYPE_CHECKING:
 NAMES = ("A", "B")
 """Names of the two flights in charts and tables."""
 
-# Maps fields of `FlightStatistics` to their label and number of decimals.
-_STATISTICS = {
-    "armed_s": ("armed, s", 0),
-    "distance_m": ("distance flown, m", 0),
-    "max_height_m": ("max height above home, m", 1),
-    "max_distance_m": ("max distance from home, m", 0),
-    "max_speed_m_s": ("max speed, m/s", 1),
-    "max_climb_m_s": ("max climb rate, m/s", 1),
-    "max_descent_m_s": ("max descent rate, m/s", 1),
-    "max_tilt_deg": ("max tilt, °", 0),
-    "end_distance_m": ("distance from home at the end, m", 1),
-    "start_voltage_v": ("battery at start, V", 2),
-    "end_voltage_v": ("battery at end, V", 2),
-    "min_voltage_v": ("battery minimum, V", 2),
-    "start_remaining_percent": ("battery at start, %", 0),
-    "end_remaining_percent": ("battery at end, %", 0),
-    "max_current_a": ("max current, A", 1),
-    "min_satellites": ("min satellites", 0),
-    "max_hdop": ("max HDOP", 2),
-    "max_vibration_m_s2": ("max vibration, m/s²", 1),
-    "clips": ("accelerometer clippings", 0),
-    "max_estimator_ratio": ("max estimator ratio", 2),
-    "lost_percent": ("messages lost, %", 2),
-}
 # The charts: title, unit, function that returns the time series of a flight, and column.
 _CHARTS: tuple[tuple[str, str, Callable[[FlightLog], TimeSeries | None], str], ...] = (
     ("Height", "metres above home", lambda flight: flight.track, "altitude_relative_m"),
@@ -96,15 +72,16 @@ def _armed_at(flight: FlightLog) -> float:
 
 def _differences(statistics: tuple[FlightStatistics, FlightStatistics]) -> Section:
     rows = []
-    for field, (name, digits) in _STATISTICS.items():
-        value_a, value_b = (getattr(flight_statistics, field) for flight_statistics in statistics)
+    for name, statistic in STATISTICS.items():
+        digits = statistic.decimals
+        value_a, value_b = (getattr(flight_statistics, name) for flight_statistics in statistics)
         if value_a is None and value_b is None:
             continue
         difference = ""
         if value_a is not None and value_b is not None:
             difference = f"{round(value_b - value_a, digits) + 0.0:+.{digits}f}"  # + 0.0 converts -0.0 to 0.0
         texts = ("unknown" if value is None else f"{value:.{digits}f}" for value in (value_a, value_b))
-        rows.append((name, *texts, difference))
+        rows.append((statistic.label, *texts, difference))
     return Section("Differences", [Table(("statistic", *NAMES, "B − A"), rows)])
 
 

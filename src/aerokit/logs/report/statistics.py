@@ -72,6 +72,45 @@ class FlightStatistics(Snapshot):
     """Percentage of lost messages, as an average over time. A silence counts as 100 %."""
 
 
+class Statistic(Snapshot):
+    """How a field of `FlightStatistics` is compared, and the warning about a value that is out of its normal range."""
+
+    label: str
+    decimals: int
+    warning: str = ""
+    minimum: float = -math.inf
+    maximum: float = math.inf
+
+
+STATISTICS = {
+    "armed_s": Statistic("armed, s", 0),
+    "distance_m": Statistic("distance flown, m", 0),
+    "max_height_m": Statistic("max height above home, m", 1),
+    "max_distance_m": Statistic("max distance from home, m", 0),
+    "max_speed_m_s": Statistic("max speed, m/s", 1),
+    "max_climb_m_s": Statistic("max climb rate, m/s", 1),
+    "max_descent_m_s": Statistic("max descent rate, m/s", 1),
+    "max_tilt_deg": Statistic("max tilt, °", 0),
+    "end_distance_m": Statistic("distance from home at the end, m", 1),
+    "start_voltage_v": Statistic("battery at start, V", 2),
+    "end_voltage_v": Statistic("battery at end, V", 2),
+    "min_voltage_v": Statistic("battery minimum, V", 2),
+    "start_remaining_percent": Statistic("battery at start, %", 0),
+    "end_remaining_percent": Statistic("battery at end, %", 0),
+    "max_current_a": Statistic("max current, A", 1),
+    "min_satellites": Statistic("min satellites", 0, "{:.0f} satellites at minimum", minimum=6),
+    "max_hdop": Statistic("max HDOP", 2),
+    "max_vibration_m_s2": Statistic(
+        "max vibration, m/s²", 1, "vibration up to {:.0f} m/s² (normal: below 30)", maximum=30
+    ),
+    "clips": Statistic("accelerometer clippings", 0, "{:.0f} accelerometer clippings", maximum=0),
+    "max_estimator_ratio": Statistic(
+        "max estimator ratio", 2, "the estimator rejected measurements (ratio {:.2f}, above 1)", maximum=1
+    ),
+    "lost_percent": Statistic("messages lost, %", 2, "{:.0f} % of the messages lost", maximum=2),
+}
+
+
 def statistics_of(flight: FlightLog) -> FlightStatistics:
     spans = _ArmedSpans(flight)
     north_east = metres_from_home(flight)
@@ -427,15 +466,9 @@ def _first_few(texts: list[str]) -> str:
 
 
 def _warnings_sentence(statistics: FlightStatistics) -> str:
-    warnings = []
-    if statistics.max_vibration_m_s2 is not None and statistics.max_vibration_m_s2 > 30:
-        warnings.append(f"vibration up to {statistics.max_vibration_m_s2:.0f} m/s² (normal: below 30)")
-    if statistics.clips:
-        warnings.append(f"{statistics.clips:.0f} accelerometer clippings")
-    if statistics.max_estimator_ratio is not None and statistics.max_estimator_ratio > 1:
-        warnings.append(f"the estimator rejected measurements (ratio {statistics.max_estimator_ratio:.2f}, above 1)")
-    if statistics.min_satellites is not None and statistics.min_satellites < 6:
-        warnings.append(f"{statistics.min_satellites:.0f} satellites at minimum")
-    if statistics.lost_percent is not None and statistics.lost_percent > 2:
-        warnings.append(f"{statistics.lost_percent:.0f} % of the messages lost")
+    warnings = [
+        statistic.warning.format(value)
+        for name, statistic in STATISTICS.items()
+        if (value := getattr(statistics, name)) is not None and not statistic.minimum <= value <= statistic.maximum
+    ]
     return "Check: " + "; ".join(warnings) + "." if warnings else ""

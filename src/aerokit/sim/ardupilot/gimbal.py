@@ -39,17 +39,6 @@ _CAPABILITIES = (
 _FROM_NORTH = frozenset({MavMountMode.GPS_POINT, MavMountMode.SYSID_TARGET, MavMountMode.HOME_LOCATION})
 
 
-DEFAULTS = {
-    "MNT1_DEFLT_MODE": 3.0,
-    "MNT1_ROLL_MIN": -30.0,
-    "MNT1_ROLL_MAX": 30.0,
-    "MNT1_PITCH_MIN": -90.0,
-    "MNT1_PITCH_MAX": 20.0,
-    "MNT1_YAW_MIN": -180.0,
-    "MNT1_YAW_MAX": 180.0,
-    **dict.fromkeys((f"MNT1_{mode_name}_{axis}" for mode_name in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
-}
-"""Defaults for parameters that a vehicle with a reduced ``parameter_count`` may lack."""
 _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 
@@ -84,7 +73,7 @@ class ArduPilotGimbal:
         return self._vehicle.parameters["MNT1_TYPE"] != 0
 
     def setting(self, name: str) -> float:
-        return self._vehicle.parameters.get(name, DEFAULTS[name])
+        return self._vehicle.parameters[name]
 
     @property
     def angles(self) -> tuple[float, float, float]:

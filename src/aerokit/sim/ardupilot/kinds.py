@@ -17,9 +17,8 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
-    """Return the parameters of a firmware, or about ``count`` of them. Those that the simulation reads are included."""
-    used = [name for (name,) in rows_of(kind, "used_parameters.csv")]
-    return SimParameters.from_text(_read(f"{kind}.param.csv"), used=used, count=count)
+    """Return the parameters of a firmware. ``count`` limits how many are listed."""
+    return SimParameters.from_text(_read(f"{kind}.param.csv"), count)
 
 
 def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:

@@ -52,7 +52,7 @@ class ArduPilotVehicle(ArduPilotHost):
     - ``boot_time_s``: seconds until the estimator has a position; SITL takes 41.5; with 0 the vehicle is ready at once
     - ``boot_text``: True sends the plain text that a serial or TCP port sends before the first frame
     - ``version``: version in AUTOPILOT_VERSION and the banner; ``parameters``: values that differ from the defaults;
-      ``parameter_count``: reduces the number of parameters, for quick tests; ``parameter_errors``: sends PARAM_ERROR
+      ``parameter_count``: limits how many are listed, for quick tests; ``parameter_errors``: sends PARAM_ERROR
     - ``logs``: logs of earlier runs; ``link_bytes_per_s``: see `ArduPilotStorage`
     - ``battery_percent``: initial charge; ``battery_capacity_mah``: capacity of the battery
     - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: range of the range finder, 0 without one

@@ -22,29 +22,12 @@ from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
 
-# Names of the parameters that the simulation reads or that clients expect.
-_USED_PARAMETERS = """
-BAT1_CAPACITY BAT1_N_CELLS BAT1_SOURCE BAT_CRIT_THR BAT_EMERGEN_THR BAT_LOW_THR CAL_ACC0_ID
-CBRK_SUPPLY_CHK COM_ARM_WO_GPS COM_DISARM_LAND COM_DISARM_PRFLT COM_DL_LOSS_T COM_FAIL_ACT_T
-COM_DLL_EXCEPT COM_FLTMODE1 COM_LOW_BAT_ACT COM_OBL_RC_ACT COM_OF_LOSS_T COM_RCL_EXCEPT COM_RC_IN_MODE
-COM_RC_LOSS_T COM_RC_OVERRIDE COM_RC_STICK_OV COM_SPOOLUP_TIME EKF2_EN EKF2_EV_CTRL EKF2_GPS_CHECK
-EKF2_GPS_CTRL FW_AIRSPD_MAX PLD_BTOUT PLD_HACC_RAD PLD_MAX_SRCH PLD_SRCH_ALT PLD_SRCH_TOUT
-FW_AIRSPD_MIN FW_AIRSPD_TRIM FW_LND_ANG FW_T_CLMB_MAX FW_T_SINK_MAX FW_T_SINK_MIN FW_R_LIM GF_ACTION
-GF_MAX_HOR_DIST GF_MAX_VER_DIST LNDMC_Z_VEL_MAX MAV_COMP_ID MAV_SYS_ID MAV_TYPE MIS_TAKEOFF_ALT
-MPC_ACC_DOWN_MAX MPC_ACC_HOR MPC_ACC_UP_MAX MPC_LAND_ALT1 MPC_LAND_ALT2 MPC_LAND_SPEED MPC_MANTHR_MIN
-MPC_MAN_TILT_MAX MPC_MAN_Y_MAX MPC_THR_HOVER MPC_TILTMAX_AIR MPC_TKO_RAMP_T MPC_TKO_SPEED MPC_VEL_MANUAL
-MPC_XY_CRUISE MPC_XY_VEL_MAX MPC_Z_VEL_MAX_DN MPC_Z_VEL_MAX_UP MPC_YAWRAUTO_MAX MPC_Z_V_AUTO_DN
-MPC_Z_V_AUTO_UP MIS_TKO_LAND_REQ NAV_ACC_RAD NAV_DLL_ACT NAV_FW_ALT_RAD NAV_LOITER_RAD NAV_RCL_ACT
-RC_MAP_PITCH RC_MAP_ROLL RC_MAP_THROTTLE RC_MAP_YAW RTL_CONE_ANG RTL_DESCEND_ALT RTL_LAND_DELAY
-RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SYS_AUTOSTART SYS_HAS_GPS
-"""
-
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
-    """Return the parameters of a "quadrotor" or an "airplane". ``count`` limits their number."""
+    """Return the parameters of a "quadrotor" or an "airplane". ``count`` limits how many are listed."""
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
-    return SimParameters.from_text(data.decode(), used=_USED_PARAMETERS.split(), count=count)
+    return SimParameters.from_text(data.decode(), count)
 
 
 class Px4ParameterMount(ParameterPackMount):

@@ -38,9 +38,8 @@ class SimulatedPx4(Px4Vehicle):
       unknown modes, switches to RTL when set-points stop, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
     - ``fast_rate_hz``: rate of attitude, position and targets on "normal" links
     - ``link_modes``: MAV_n_MODE of the first link, the second …: "normal", "onboard", "config" or "minimal"
-    - ``parameters``: values that differ from the defaults; ``parameter_count``: limits the number of parameters of the
-      vehicle, for quick tests; ``parameter_file``, ``link_bytes_per_s``: see `Px4Storage`; ``logs``: logs of earlier
-      flights
+    - ``parameters``: values that differ from the defaults; ``parameter_count``: limits how many are listed,
+      for quick tests; ``parameter_file``, ``link_bytes_per_s``: see `Px4Storage`; ``logs``: logs of earlier flights
     - ``signing_key``: see `Px4Signing`
     """
 

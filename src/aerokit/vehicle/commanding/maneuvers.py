@@ -319,7 +319,7 @@ class ManeuverActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ten seconds.
             OperationTimeout: the vehicle did not report the state in time.
         """
-        if MavCmd.DO_VTOL_TRANSITION in self.autopilot.unsupported_commands or not self.telemetry.is_vtol:
+        if not (self.autopilot.has_vtols and self.telemetry.is_vtol):
             raise NotSupported(f"transition_to: this {self.autopilot.firmware} vehicle is not a VTOL; nothing was sent")
         # The decorator `checks_arguments` has refused every other state.
         target_state, cell = VTOL_STATES[state], self.telemetry.vtol_state

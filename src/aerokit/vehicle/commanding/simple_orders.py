@@ -1,15 +1,14 @@
 """``SimpleOrder``: an order that consists of one command, declared as a row of a table.
 
-A row has the command, its parameters with units and ranges, and the message that reports its effect.
-`aerokit.autopilots` lists the commands that a firmware does not support (``unsupported_commands``), and
-`aerokit.protocols.command` the commands that must not be repeated. The method that gives the order documents its
-arguments, as in ``devices/actuators.py``.
+A row has the command, its parameters with units and ranges, the message that reports its effect, and the firmwares that
+do not have the command. `aerokit.protocols.command` lists the commands that must not be repeated. The method that gives
+the order documents its arguments, as in ``devices/actuators.py``.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import anyio
 
@@ -25,10 +24,13 @@ from aerokit.vehicle.commanding.progress import await_progress
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.autopilots import Autopilot
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, Topic
 
+Firmware = Literal["ArduPilot", "ArduCopter", "ArduPlane", "Rover", "ArduSub", "PX4"]
+"""Name of one firmware, or of an autopilot with all its firmwares."""
 MessageT = TypeVar("MessageT", bound="Message")
 
 EFFECT_TIMEOUT_S = 5.0
@@ -73,18 +75,22 @@ class SimpleOrder(Snapshot):
 
     ``name`` is the public method, for error texts. In ``params``, a number is sent unchanged, and an `Argument` stands
     for the next value that is passed to ``send``. Without ``effect``, the acknowledgement ends the order, because no
-    message reports its effect.
+    message reports its effect. ``missing_on`` names the firmwares that do not have the command.
     """
 
     name: str
     command: int
     params: tuple[Argument | float, ...] = ()
     effect: Effect | None = None
+    missing_on: tuple[Firmware, ...] = ()
+
+    def is_supported(self, autopilot: Autopilot) -> bool:
+        return not {autopilot.name, autopilot.firmware}.intersection(self.missing_on)
 
     def check_supported(self, context: VehicleContext) -> None:
-        """Raise NotSupported if the firmware does not support the command."""
+        """Raise NotSupported if the firmware does not have the command."""
         autopilot = context.session.autopilot
-        if self.command in autopilot.unsupported_commands:
+        if not self.is_supported(autopilot):
             raise NotSupported(
                 f"{self.name}: {autopilot.firmware} has no MAV_CMD_{MavCmd(self.command).name}; nothing was sent"
             )

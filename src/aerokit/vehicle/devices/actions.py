@@ -36,6 +36,7 @@ INJECT_FAILURE = SimpleOrder(
     "inject_failure",
     MavCmd.INJECT_FAILURE,
     (Argument("unit", 0, 255), Argument("kind", 0, 255), Argument("instance", 0, 16)),
+    missing_on=("ArduPilot",),
 )
 TUNE = re.compile(r"[A-Ga-gLlMmNnOoPpSsTt0-9#+.<>\- ]+")
 """Characters allowed in a tune: those of QBASIC 1.1's PLAY statement, which ArduPilot and PX4 understand."""

@@ -51,14 +51,20 @@ PULSE = Argument("pulse_us", 500, 2500)
 COUNT = Argument("count", 1, 1000)
 PERIOD = Argument("period_s", 0, 60, above=True)
 ON = Argument("on", 0, 1)
-SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), Effect("ServoOutputRaw", _has_pulse))
-REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD))
-SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), Effect("RelayStatus", _is_switched))
-REPEAT_RELAY = SimpleOrder("repeat_relay", MavCmd.DO_REPEAT_RELAY, (RELAY, COUNT, PERIOD))
 GEAR_DOWN, GEAR_UP = 0, 1
-LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, (ALL_GEARS, Argument("up", 0, 1)))
-LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), Effect("IlluminatorStatus", _is_lit))
-PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, (Argument("action", 0, 2),))
+SERVO_EFFECT = Effect("ServoOutputRaw", _has_pulse)
+RELAY_EFFECT = Effect("RelayStatus", _is_switched)
+LIGHT_EFFECT = Effect("IlluminatorStatus", _is_lit)
+GEAR = (ALL_GEARS, Argument("up", 0, 1))
+PARACHUTE_ACTION = (Argument("action", 0, 2),)
+SET_SERVO = SimpleOrder("set_servo", MavCmd.DO_SET_SERVO, (SERVO, PULSE), SERVO_EFFECT, missing_on=("PX4",))
+REPEAT_SERVO = SimpleOrder("repeat_servo", MavCmd.DO_REPEAT_SERVO, (SERVO, PULSE, COUNT, PERIOD), missing_on=("PX4",))
+SET_RELAY = SimpleOrder("set_relay", MavCmd.DO_SET_RELAY, (RELAY, ON), RELAY_EFFECT, missing_on=("PX4",))
+REPEAT_RELAY = SimpleOrder("repeat_relay", MavCmd.DO_REPEAT_RELAY, (RELAY, COUNT, PERIOD), missing_on=("PX4",))
+LANDING_GEAR = SimpleOrder("landing_gear", MavCmd.AIRFRAME_CONFIGURATION, GEAR, missing_on=("PX4", "Rover", "ArduSub"))
+LIGHTS = SimpleOrder("set_lights", MavCmd.ILLUMINATOR_ON_OFF, (ON,), LIGHT_EFFECT, missing_on=("PX4", "ArduPilot"))
+PARACHUTE = SimpleOrder("parachute", MavCmd.DO_PARACHUTE, PARACHUTE_ACTION, missing_on=("PX4", "Rover", "ArduSub"))
+MOTOR_TEST = SimpleOrder("test_motor", MavCmd.DO_MOTOR_TEST, missing_on=("PX4",))
 PERCENT = MotorTestThrottleType.THROTTLE_PERCENT
 
 
@@ -159,7 +165,7 @@ class Actuators(ReadOnly):
         params = [math.nan if value is None else float(value) for value in values]
         params += [math.nan] * (ACTUATORS - len(params))
         first_set = 0  # index of the set: actuators 1 to 6
-        order = SimpleOrder("set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, first_set))
+        order = SimpleOrder("set_actuators", MavCmd.DO_SET_ACTUATOR, (*params, first_set), missing_on=("ArduPilot",))
         await order.send(self._context, topic="actuators")
 
     async def raise_landing_gear(self) -> None:
@@ -235,7 +241,7 @@ class Actuators(ReadOnly):
         start: tuple[float, ...]
         stop: tuple[float, ...]
         # On ArduPilot, a test with throttle 0 for 0 s ends a running test. On PX4, a test of 0 s releases the output.
-        if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
+        if not MOTOR_TEST.is_supported(session.autopilot):
             command = MavCmd.ACTUATOR_TEST
             unused = (0, 0)
             start = (throttle_percent / 100, duration_s, *unused, number)

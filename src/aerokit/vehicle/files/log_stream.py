@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LogStream"]
 
-START = SimpleOrder("logs.stream", MavCmd.LOGGING_START, (0,))
+START = SimpleOrder("logs.stream", MavCmd.LOGGING_START, (0,), missing_on=("ArduPilot",))
 STOP = SimpleOrder("logs.stream", MavCmd.LOGGING_STOP)
 MAGIC, HEADER_BYTES = b"ULog\x01\x12\x35", 16
 NO_MESSAGE_START = 255
