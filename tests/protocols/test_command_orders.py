@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -132,6 +134,13 @@ def test_order_waits_for_last_sending() -> None:
     machine.expire(1.8)
     assert confirmations(machine) == []
     assert text_of(machine).endswith("sent 2 times within 1.8 s; not sent again: the pilot took over")
+
+
+def test_reliability_page_lists_the_unrepeatable_commands() -> None:
+    page = Path(__file__).parents[2] / "docs" / "reliability.md"
+    _, _, table = page.read_text(encoding="utf-8").partition("### Commands that are never repeated")
+    listed = set(re.findall(r"^\| ([A-Z_]+) ", table.partition("\n### ")[0], re.MULTILINE)) - {"MAV_CMD"}
+    assert listed == {MavCmd(command).name for command in UNREPEATABLE_COMMANDS}
 
 
 @pytest.mark.parametrize("command", UNREPEATABLE_COMMANDS)

@@ -123,7 +123,7 @@ class Px4(Autopilot):
     # mission_base.cpp, update_mission. A finished mission is not flown again before an item is selected.
     no_mission_text: str | None = "No valid mission available"
     prearm_depends_on_mode = True
-    # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
+    # PX4 answers by a status text for each failing check (Commander.cpp; measured with 1.17 in simulation).
     runs_prearm_checks = True
     # Modes that need an RC receiver (mode_requirements.cpp). The receiver's health bit says whether these modes can be
     # used, even if another mode is active (modeCheck.cpp).

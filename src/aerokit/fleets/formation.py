@@ -414,12 +414,12 @@ class Formations(Travel):
         return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
-        arguments = {leader: "leader", **dict.fromkeys(formation.offsets, "formation")}
-        for name, argument in arguments.items():
-            if name not in self.members:
-                raise InvalidArgument(
-                    f"{argument}: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
-                )
+        for argument, names in (("leader", [leader]), ("formation", formation.offsets)):
+            for name in names:
+                if name not in self.members:
+                    raise InvalidArgument(
+                        f"{argument}: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
+                    )
         if leader in formation.offsets:
             raise InvalidArgument(f"formation: {leader!r} is the leader and cannot have an offset")
         min_m = self._context.min_distance_m

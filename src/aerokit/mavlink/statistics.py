@@ -192,7 +192,7 @@ class SourceStatistics(SourceFields):
         self._missing = self._skipped_over = 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        """Process a frame of the stream that is not the current one. Return a result of :meth:`out_of_order`."""
+        """Process a frame of the other stream. Return how it is to be treated, as :meth:`out_of_order` does."""
         current_count = self.received - self._stream_start
         is_other_longer = self._other_count > current_count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S

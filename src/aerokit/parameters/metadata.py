@@ -131,7 +131,7 @@ class Metadata(Mapping[str, ParameterMetadata]):
         return tuple(name for name in names if name in self and self[name].reboot_required)
 
     def check(self, name: str, value: float) -> None:
-        """Raise :class:`InvalidArgument` if the value is NaN, or if the metadata does not recommend it."""
+        """Raise :class:`InvalidArgument` if the value is NaN, or outside the recommended range or values."""
         if math.isnan(value):
             raise InvalidArgument(f"{name} = {value!r} is not a number")
         problem = self[name].problem(value) if name in self else None

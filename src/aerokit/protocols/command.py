@@ -40,7 +40,7 @@ class Repetition(NamedTuple):
     value: float = 0.0
 
 
-# Commands whose repetition has a further effect.
+# Commands whose repetition has a further effect. docs/reliability.md has the same table.
 UNREPEATABLE_COMMANDS: Mapping[int, Repetition] = {
     MavCmd.COMPONENT_ARM_DISARM: Repetition("arms a vehicle that a pilot has disarmed since", param=1, value=1),
     MavCmd.CONDITION_YAW: Repetition("turns by the same angle again", param=4, value=1),

@@ -93,9 +93,9 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """Read some parameters by name. The result has one answer for each name.
 
     Args:
-        probe: True to detect unknown names. ArduPilot, and PX4 before 1.17, do not answer requests for them. Therefore
-            the parameter with index 0 is requested as well. If it is answered, but a name repeatedly is not, the result
-            for the name is a ParameterRejected without a code.
+        probe: True to detect unknown names, which ArduPilot, and PX4 before 1.17, do not answer. The parameter with
+            index 0 is then requested too. A vehicle that answers this request but not those for a name has no parameter
+            of that name: its result is a ParameterRejected without a code.
         possibly_stale: maps a name to its old value, which a delayed message may still report. If an answer has this
             value, the parameter is read once more.
         alternatives: maps a name to other names of the same parameter. Once one name is answered, the results for the

@@ -58,11 +58,11 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    In each of them, the vehicle sank 2 m or more, at 3 m/s or more. The descent ended within 0.6 s (or 1.5 intervals of
-    the logged velocities), and one of these is true:
+    In each of them, the vehicle sank 2 m or more, at 3 m/s or more. It stopped sinking within 0.6 s (or 1.5 intervals
+    of the logged velocities), and one of these is true:
 
-    - It was disarmed within 30 s. Until then, its logged height changed by at most 1.5 m.
-    - It was at most 3 m above home. In the next 30 s, its logged height changed by at most 1.5 m.
+    - It was disarmed within 30 s after the stop, and its logged height changed by at most 1.5 m until then.
+    - It was at most 3 m above home, and its logged height changed by at most 1.5 m in the next 30 s.
     - The log has evidence of a fall: see `Fall.reasons`.
 
     If the log ends during a descent, the descent is a fall or hard landing if there is such evidence, or if the vehicle

@@ -181,10 +181,10 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
         self._leg_start = self.vehicle.wing.place
         own_north, own_east, own_down = self._leg_start
-        point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
-        north, east, down = point
+        # `world_point` returns None for an invalid place.
+        north, east, down = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
         has_no_place = (item.x, item.y) == (0, 0)
-        if has_no_place:
+        if has_no_place:  # Zero coordinates mean the present position.
             north, east = own_north, own_east
         if manoeuvre == _LOITER:  # An altitude of 0 in a relative frame means the present altitude (Location.cpp).
             keeps_altitude = item.z == 0 and item.frame not in _ABSOLUTE

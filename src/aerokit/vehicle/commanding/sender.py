@@ -41,7 +41,7 @@ ACCEPTANCE_REVOKED = "the vehicle accepted the command and then refused it"
 
 
 class OrderSender:
-    """Sends the commands of orders and repeats them only as docs/reliability.md allows."""
+    """Sends the MAVLink commands that carry out an order, and repeats them only as docs/reliability.md allows."""
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter) -> None:
         self._session, self._arbiter = session, arbiter
@@ -158,8 +158,8 @@ class OrderSender:
     ) -> None:
         """Send the command to disarm, and once more if HEARTBEAT still reports armed after ``report_timeout_s``.
 
-        A link that duplicates frames makes the vehicle answer twice, and the second answer to a command to arm looks
-        like an answer to this command.
+        The COMMAND_ACK alone is no proof. On a link that duplicates frames, the second COMMAND_ACK of an earlier
+        command to arm looks like the one of this command.
         """
         armed, started = self._session.telemetry.armed, self._session.connection.now()
         await self.send_arm(order, armed=False, force=force)

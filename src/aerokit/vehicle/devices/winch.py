@@ -109,8 +109,8 @@ class Winch(ReadOnly):
     def _has_paid_out(self, status_before: m.WinchStatus, length_m: float) -> Callable[[m.WinchStatus], bool]:
         """Return a function that returns True for a status which reports that the length was paid out.
 
-        The winch adds the length to that at which the command arrives. If the winch was turning, that length lies
-        between the one before and the one that it would have reached by the first status after the acknowledgement.
+        The winch pays out ``length_m`` from the length of its line at the time when it gets the command. If it was
+        turning, this length is not known exactly.
         """
         frame, now = status_before.received_frame, self._context.session.connection.now
         reported_at = now() if frame is None else frame.received_at
@@ -121,6 +121,7 @@ class Winch(ReadOnly):
             nonlocal turned_m
             if turned_m is None:
                 turned_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
+            # The winch got the command between `status_before` and the first status after the acknowledgement.
             start_m = status.line_length - length_m - status_before.line_length
             is_near = abs(start_m - turned_m / 2) <= abs(turned_m / 2) + LENGTH_TOLERANCE_M
             return is_near and (not was_turning or abs(status.speed) <= RATE_TOLERANCE_M_S)
