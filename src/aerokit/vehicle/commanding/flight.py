@@ -72,8 +72,8 @@ class FlightActions(VehicleBase):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, or it disarmed or
-                hit the ground, during the take-off.
+            OperationRejected: the vehicle is not armed, or is already flying (nothing was sent). Or during the
+                take-off, its mode changed, or it disarmed or hit the ground.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -113,7 +113,7 @@ class FlightActions(VehicleBase):
             raise explained from error
 
     def _with_landed_state(self, error: CommandRejected) -> CommandRejected | None:
-        """Add the landed state to the error of a refused take-off.
+        """Return the error of a refused take-off with the landed state added to it.
 
         Returns None if the vehicle is not known to be in the air.
         """
@@ -254,7 +254,7 @@ class FlightActions(VehicleBase):
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
         except OperationRejected:
             # After a landing, PX4 disarms and changes to LOITER, which ends the order. The vehicle is then on the
-            # ground, as ordered. A refusal does not end the order.
+            # ground, as ordered. If the vehicle has refused the mode, the order has not ended, and the error is raised.
             is_down = self.telemetry.is_confirmed_disarmed or is_reported_on_ground(self.telemetry)
             if not (order.end and is_down and order.is_newest):
                 raise
@@ -271,8 +271,8 @@ class FlightActions(VehicleBase):
             # Messages from before the order may be outdated.
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
-            # A submarine "lands" by going to the surface. Most submarines have no global position, so an unknown depth
-            # is sufficient.
+            # A submarine "lands" by going to the surface. Most submarines do not report a global position. Without one,
+            # the mode change alone shows that they have surfaced.
             has_surfaced = has_left_surfacing_mode() and not is_deep()
             return ground.confirms(is_disarmed or is_landed or has_surfaced)
 

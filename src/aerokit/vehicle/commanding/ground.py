@@ -89,7 +89,7 @@ class ImpactDetector:
         velocity, updated_at = cell.latest, cell.updated_at
         if velocity is None or updated_at == self._updated_at:
             return
-        if updated_at < self._updated_at:  # The computer slept; this makes all values older.
+        if updated_at < self._updated_at:  # The computer slept, and aerokit has moved the times of all values back.
             self._updated_at, self._sank_fast_at = updated_at, -math.inf
             return
         # An impact may be shorter than the interval between two velocities, so consecutive velocities are compared even
@@ -115,7 +115,7 @@ class ImpactDetector:
             # The vehicle flies on, so it did not hit the ground.
             self._impact_m_s = None
             self._impact_height_m = None
-        # While the vehicle does not sink, this is the height before the next descent.
+        # While the vehicle does not sink, its height is the one before the next descent.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
@@ -143,7 +143,7 @@ class GroundCheck:
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
         self._impact = ImpactDetector(session.telemetry)
-        # Time and height of the report that the vehicle is on the ground.
+        # Time of the report that the vehicle is on the ground, and height above home at that time.
         self._reported_at: float | None = None
         self._reported_height_m: float | None = None
         # Time since which the vehicle moves up or down slower than SETTLED_M_S; infinite while it moves faster.
@@ -164,7 +164,7 @@ class GroundCheck:
 
     def confirms(self, is_reported: bool) -> bool:
         """Return True if the vehicle is reported on the ground, has settled since, and did not fall."""
-        now, velocity = self._session.connection.now(), self._session.telemetry.velocity
+        now = self._session.connection.now()
         self._impact.update()
         if not is_reported:
             self._reported_at = None
@@ -173,7 +173,7 @@ class GroundCheck:
             self._reported_at = now
             self._settled_since = math.inf
             self._reported_height_m = self._impact.current_height()
-        return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
+        return self._has_settled(now) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
         return self.fall() if self.is_reported_on_ground else in_flight()
@@ -186,13 +186,11 @@ class GroundCheck:
             return f"the vehicle was disarmed in the air and sinks at {self._down_m_s():.1f} m/s"
         return self._impact.describe() or None
 
-    def _has_settled(self, now: float, updated_at: float) -> bool:
-        """Return True if the vehicle has stopped climbing or sinking.
-
-        ``updated_at`` is the time of the last velocity.
-        """
+    def _has_settled(self, now: float) -> bool:
+        """Return True if the vehicle has stopped climbing or sinking."""
+        velocity_at = self._session.telemetry.velocity.updated_at
         reported_at = now if self._reported_at is None else self._reported_at
-        if now - updated_at > VELOCITY_MAX_AGE_S:
+        if now - velocity_at > VELOCITY_MAX_AGE_S:
             # Without a recent velocity, the report that the vehicle is on the ground is sufficient.
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
@@ -203,8 +201,8 @@ class GroundCheck:
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, STANDING_M)
             return is_still and now - reported_at >= STANDING_S
-        self._settled_since = min(self._settled_since, max(updated_at, reported_at))
-        return updated_at >= self._settled_since + SETTLING_S
+        self._settled_since = min(self._settled_since, max(velocity_at, reported_at))
+        return velocity_at >= self._settled_since + SETTLING_S
 
     def _down_m_s(self) -> float:
         velocity = self._session.telemetry.velocity.latest

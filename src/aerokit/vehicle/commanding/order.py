@@ -269,7 +269,7 @@ class Order:
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
         elif is_expected and is_settled:
-            # An earlier order of the program has changed the mode. If `mode_before` returns, another party has set it.
+            # An earlier order of the program has changed the mode. After this, only another party can change it back.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:
@@ -284,8 +284,8 @@ class Order:
         self._mode_now = number
 
     def on_system_status(self, state: int) -> None:
-        # A failsafe that was active before the order does not end it. `end` ignores a failsafe if the order ends the
-        # flight.
+        # A failsafe that was active before the order does not end the order. `end` allows for orders that stay valid
+        # during any failsafe.
         if is_worse_failsafe(state, self._last_state):
             self.failsafe = self.failsafe or failsafe_text(state)
         self._last_state = state

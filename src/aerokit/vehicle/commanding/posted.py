@@ -125,8 +125,8 @@ class PostedOrder:
                 may_retry = error.result == MavResult.TEMPORARILY_REJECTED and attempts_left and not self.end
                 if may_retry and await self._is_valid_at_next_heartbeat(timeout):
                     continue
-                # Ignore the refusal if HEARTBEAT has reported an effect of the order, and reports this mode. The order
-                # may have other modes, too.
+                # Ignore the refusal if HEARTBEAT has reported an effect of the order. It must also report this mode,
+                # because the order may have several modes.
                 if not (self._order.is_confirmed and self._session.telemetry.is_in(mode)):
                     raise
             return

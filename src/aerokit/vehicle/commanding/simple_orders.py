@@ -146,8 +146,8 @@ class SimpleOrder(Snapshot):
     ) -> None:
         """Send the command and wait for a status text that reports its effect.
 
-        ``is_done(text, seconds_since_ack)`` is called repeatedly for every text received so far, so it can accept a
-        text after some time. Only for orders without ``effect``.
+        ``is_done(text, seconds_since_ack)`` is called repeatedly for every text received so far, so it may accept a
+        text only some time after the acknowledgement. Only for orders without ``effect``.
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """
@@ -184,7 +184,7 @@ class SimpleOrder(Snapshot):
         target: int,
         timeout: float,
     ) -> None:
-        """Request the message until it reports the effect. Returns early if the vehicle does not have the message.
+        """Request ``effect.message`` until it reports the effect, or until the vehicle refuses to send it.
 
         ``target`` is the id of the component that sends the message.
         """

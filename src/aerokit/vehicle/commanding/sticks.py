@@ -57,16 +57,16 @@ class StickStream(SteeringStream[StickInput]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
     Entering the block sends the initial positions for a second and then changes the mode. Leaving the block, also
-    by an exception, orders the vehicle to hold, except after a newer order or a takeover. ArduPilot is also told to
+    by an exception, orders the vehicle to hold, except after a newer order or a takeover. It also makes ArduPilot
     release the sticks. If the stream stops by itself (no new positions, a blocked event loop, a silent vehicle,
     another mode), the next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s). ArduCopter without a
     transmitter executes the action of FS_THR_ENABLE after every end of a stream.
 
-    PX4 has no message that releases the sticks. COM_RC_LOSS_T (0.5 s) after every end of a stream, it treats the sticks
-    as lost. Without another source of manual control, it then executes NAV_RCL_ACT (return by default), even in hold
-    mode unless bit 1 of COM_RCL_EXCEPT is set.
+    PX4 has no message that releases the sticks. After every end of a stream, it waits for COM_RC_LOSS_T (0.5 s) and
+    then treats the sticks as lost. Without another source of manual control, it executes NAV_RCL_ACT (return by
+    default). To prevent this in hold mode, set bit 1 of COM_RCL_EXCEPT.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.

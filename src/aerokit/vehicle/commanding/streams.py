@@ -269,7 +269,7 @@ class SteeringStream(ValueStream[ValueT]):
         return self
 
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
-        """Order a hold. If the stream has stopped by itself, raise its error, unless it was raised before."""
+        """Order a hold. If the stream has already stopped, raise its error instead, unless it was raised before."""
         if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)
         if self._stop_error is None:
@@ -373,7 +373,10 @@ class TakeoverCheck:
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:
-    """Return the values of those parameters that the vehicle has. Raises ParameterTimeout without an answer."""
+    """Read these parameters by ``probe``, and return the values of those that the vehicle has.
+
+    Raises ParameterTimeout if the vehicle does not answer.
+    """
     answers = await probe(*names)
     for answer in answers.values():
         if isinstance(answer, ParameterTimeout):

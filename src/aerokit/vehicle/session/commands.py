@@ -63,7 +63,8 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # Maps each command to the acks of earlier calls that may still arrive: the times at which they became pending.
+        # For each command: one entry per ack of earlier calls that may still arrive. The entry is the time since which
+        # no call waits for that ack.
         self._pending_acks: dict[_Key, list[float]] = {}
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
@@ -95,8 +96,8 @@ class CommandSender:
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack.
 
-        Pass ``was_just_sent=True`` if `send_unconfirmed` has just sent the command. It is then sent again only if no
-        ack arrives. See also :meth:`Vehicle.command`.
+        Pass ``was_just_sent=True`` if `send_unconfirmed` has just sent the command. This call then sends it again only
+        if no ack arrives. See also :meth:`Vehicle.command`.
         """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
@@ -134,7 +135,7 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a position, as COMMAND_LONG if COMMAND_INT is unsupported.
+        """Send a command with a position as COMMAND_INT. If the firmware does not support that, send a COMMAND_LONG.
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees. ``z`` is in metres above mean sea level.
         COMMAND_LONG has no frame, so use this only if the command's altitude is always AMSL, as for DO_SET_HOME.
@@ -157,7 +158,7 @@ class CommandSender:
         """Send a COMMAND_LONG once without waiting for its ack. For code that cannot await."""
         target = self._component_id if component_id is None else component_id
         self._connection.send(command_long(self._system_id, target, command, params))
-        self._expect_acks((target, command), self._acks_of(command))
+        self._add_pending_acks((target, command), [self._connection.now()] * self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
         # An ack without a target (0) counts too. MAVLink 1 and old firmware send no target.
@@ -173,7 +174,7 @@ class CommandSender:
         """Return True if an earlier transmission of this command may still be answered."""
         # A command that is sent once would take such an ack for its own.
         earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
-        return any(recorded_at >= earliest for recorded_at in self._pending_acks.get((component_id, command), ()))
+        return any(since >= earliest for since in self._pending_acks.get((component_id, command), ()))
 
     def accepted_at(self, command: int) -> float:
         """Return the time of the autopilot's last ACCEPTED ack to us, or −inf if there was none."""
@@ -215,9 +216,9 @@ class CommandSender:
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
-                # The acks that `send_unconfirmed` has recorded as pending belong to this call. If they have arrived
-                # already, the command is repeated. This is harmless, because only commands that stop or release
-                # something are sent this way.
+                # `send_unconfirmed` has recorded the acks of its transmission as pending, but this call waits for them.
+                # If they have arrived already, this call sends the command again. This is harmless, because only
+                # commands that stop or release something are sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
@@ -246,7 +247,8 @@ class CommandSender:
                 # Acks arrive in the order of their commands. The acks received so far therefore belong to the oldest
                 # pending commands.
                 still_pending = pending_acks[exchange.answers :]
-                self._expect_acks(key, exchange.pending_answers, still_pending)
+                newly_pending = [self._connection.now()] * exchange.pending_answers
+                self._add_pending_acks(key, [*still_pending, *newly_pending])
 
     def _abort_run_of_ended_order(self, key: _Key) -> None:
         order_status = self._order_statuses.get(key)
@@ -264,20 +266,15 @@ class CommandSender:
         # PX4 sends two acks for some commands.
         return self._acks_per_command.get(command, 1)
 
-    def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
-        """Record acks that may still arrive, so that the next command ignores them.
-
-        ``count`` is the number of acks that the last command may still get. ``earlier_records`` are those from
-        :meth:`_pop_pending_acks` whose acks have still not arrived.
-        """
-        new_records = [self._connection.now()] * count
-        if earlier_records or new_records:
-            self._pending_acks.setdefault(key, []).extend([*earlier_records, *new_records])
+    def _add_pending_acks(self, key: _Key, pending_since: Sequence[float]) -> None:
+        """Record acks that may still arrive, each by a time, so that the next command ignores them."""
+        if pending_since:
+            self._pending_acks.setdefault(key, []).extend(pending_since)
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
         """Remove the pending acks, and return the times of those that may still arrive."""
         lost_before = self._connection.now() - PENDING_ACK_TIMEOUT_S
-        return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= lost_before]
+        return [since for since in self._pending_acks.pop(key, ()) if since >= lost_before]
 
     def _abort(self, error: Exception) -> None:
         for run in tuple(self._runs.values()):

@@ -139,8 +139,8 @@ class MessageRates:
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request a message at ``hz`` or faster until the returned function is called.
 
-        The rate is above 0 and at most 1000. ``is_optional`` means that the vehicle may lack the message, for example
-        because it lacks the sensor. A missing message is reported only if a request for it is not optional.
+        The rate is above 0 and at most 1000. Pass ``is_optional=True`` if the vehicle may lack the message, for example
+        because it has no such sensor. If all requests for a message are optional, no event reports that it is missing.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
@@ -324,6 +324,8 @@ class MessageRates:
         if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
+        if achieved_hz == 0 and stream.is_optional:  # An optional stream need not exist.
+            return
         # If no message arrived in the first period of the window, the stream began later. Its average is then too low.
         has_just_started = achieved_hz > 0 and stream.counts_at_checks[0] == stream.counts_at_checks[1]
         if has_just_started and not stream.is_slow:
@@ -333,8 +335,6 @@ class MessageRates:
         window_s = WATCH_WINDOW * WATCH_PERIOD_S
         min_messages = SLOW_FACTOR * stream.requested_hz * window_s - 1
         received_messages = achieved_hz * window_s
-        if achieved_hz == 0 and stream.is_optional:  # An optional stream need not exist.
-            return
         was_slow = stream.is_slow
         stream.is_slow = received_messages < min_messages
         if stream.is_slow and not was_slow:

@@ -64,7 +64,8 @@ RETRY_INTERVAL_S = 3.0
 # it may belong to an earlier request, because PX4 acknowledges a command over each of its ports.
 MAX_MODE_REQUESTS = 3
 
-# The first requests for the version are sent quickly: their number, and the interval in seconds.
+# At first, the version is requested up to EAGER_REQUESTS times in quick succession, with EAGER_INTERVAL_S seconds for
+# each acknowledgement, and as long again for the message.
 EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
@@ -114,9 +115,11 @@ async def _request(commands: CommandSender, message_id: int, *, attempt_timeout:
 STATUS_TEXT_DELAY_S = 0.3
 """Seconds to wait for status texts after a refusal."""
 
-# It divides the 10 Hz of the position, so that these messages share datagrams with the position.
 ACTION_HZ = 5.0
-"""Rate in Hz of the messages that an action waits for."""
+"""Rate in Hz of the messages that an action waits for.
+
+The position has 10 Hz. Because 5 divides 10, these messages share datagrams with the position.
+"""
 
 RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
 
@@ -192,7 +195,7 @@ class VehicleSession:
 
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         self.telemetry.receive(heartbeat)
-        # A missing message is reported only if the program has named it.
+        # Only messages that the program itself has named are reported as missing.
         are_default = rates is None
         requested_rates = self.telemetry.default_rates if rates is None else rates
         for message_type, hz in requested_rates.items():
@@ -261,7 +264,7 @@ class VehicleSession:
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
         """Raise OperationRejected unless the vehicle is known to be disarmed.
 
-        Pass ``is_current=False`` if the last HEARTBEAT is too old; the call then always raises.
+        Pass ``is_current=False`` if the last HEARTBEAT is too old to show this; the call then always raises.
         """
         if not self.telemetry.is_confirmed_disarmed or not is_current:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
@@ -330,7 +333,7 @@ class VehicleSession:
         return tuple(reasons.values())
 
     def texts_since(self, at: float) -> tuple[str, ...]:
-        """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
+        """Return the status texts (STATUSTEXT) received since ``at``, a time of the loop's clock, oldest first."""
         return tuple(text.text for text in self.telemetry.texts_since(at))
 
     @property

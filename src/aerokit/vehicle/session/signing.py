@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 
-# SETUP_SIGNING is repeated at the interval of the vehicle's HEARTBEAT. The signature of HEARTBEAT shows whether the
+# SETUP_SIGNING is repeated only once per HEARTBEAT (1 Hz), because the signature of a HEARTBEAT shows whether the
 # vehicle has accepted the key.
 RETRY_INTERVAL_S = 1.0
 
@@ -62,7 +62,7 @@ def _check_vehicle(session: VehicleSession) -> None:
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, initial_timestamp=0)
-    # The vehicle's time stamps continue from this `timestamp`. It is a second ahead of our clock, because frames that
-    # are not later than those already received would be refused as replayed.
+    # The vehicle continues its time stamps from this one, which is a second ahead of our clock: receivers would refuse
+    # frames that are not later than those already received as replayed.
     timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
     return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)
