@@ -38,7 +38,8 @@ def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
 
     ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed.
     """
-    # If HEARTBEAT reported disarmed after this delay, the order had no effect, and another party has armed the vehicle.
+    # A HEARTBEAT that reports disarmed after this delay shows that the order had no effect: another party has armed the
+    # vehicle later.
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
@@ -51,7 +52,7 @@ class CommandArbiter:
 
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
-        # Returns for how many seconds since the given time the computer was suspended.
+        # Returns how many seconds the computer has slept since the given time.
         self.slept_since: Callable[[float], float] = lambda _: 0.0
         self.newest: Order | None = None
         """The last steering order given by an action or a raw command."""
@@ -76,9 +77,9 @@ class CommandArbiter:
         # Each has the time at which it was added.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._order_numbers = itertools.count(1)
-        self._open_mode_changes = 0  # number of `changing_mode` blocks that are open
-        self._doubted_change = 0  # number of the last mode change with an unknown result
-        self._confirmed_change = 0  # number of the last mode change that was confirmed
+        self._open_mode_changes = 0  # how many `changing_mode` blocks are open
+        self._doubted_change = 0  # sequence number of the last mode change with an unknown result
+        self._confirmed_change = 0  # sequence number of the last mode change that was confirmed
         # The newest order about each topic, even if it was withdrawn or has ended.
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()
@@ -210,7 +211,7 @@ class CommandArbiter:
         if is_steering:
             self._notify_steering()
             for previous in (self.newest, self._arming_order):
-                if previous is not None:  # A change to a mode of the posted order is not a takeover.
+                if previous is not None:  # For it, a change to a mode of the posted order is not a takeover.
                     previous.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
@@ -326,9 +327,9 @@ class CommandArbiter:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
         if order is not None and order.takeover_reason:
-            is_unexplained = bool(order.modes)  # A raw command without modes may have changed the mode itself.
-            is_newest = order.is_newest  # The vehicle may be executing a posted order that is newer.
-            if is_unexplained and is_newest:
+            may_be_own_change = not order.modes  # A raw command without modes may have changed the mode itself.
+            has_newer_order = not order.is_newest  # The vehicle may be executing the newer order, which is posted.
+            if not may_be_own_change and not has_newer_order:
                 return "arm" in topics  # A takeover does not undo an order to arm.
         return bool(topics)
 

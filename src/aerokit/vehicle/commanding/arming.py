@@ -101,19 +101,20 @@ class ArmingActions(VehicleBase):
                 else:
                     await changes.next(min(timeout, ask_at - self.connection.now()))
             return
-        # The time-out has expired.
+        # The time-out has expired. The vehicle may have become ready just after the last check.
+        if missing := self._health.missing_for_flight():
+            raise OperationTimeout(
+                f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:"
+                f"{self._list_reasons(missing)}"
+            )
+
+    def _list_reasons(self, missing: list[str]) -> str:
         recent_texts = self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S)
-        missing_now = self._health.missing_for_flight()
-        if not missing_now:  # The vehicle has become ready just after the last check.
-            return
-        reasons = self._session.deduplicate_reasons(*recent_texts, *missing_now)
-        missing = "".join(f"\n  - {reason}" for reason in reasons)
+        reasons = self._session.deduplicate_reasons(*recent_texts, *missing)
+        items = "".join(f"\n  - {reason}" for reason in reasons)
         # The mode does not count as missing, because `arm` changes it.
         mode_text = "".join(f"\n{text}" for text in self._health.unarmable_mode())
-        raise OperationTimeout(
-            f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:"
-            f"{missing}{mode_text}"
-        )
+        return f"{items}{mode_text}"
 
     async def arm(
         self,
@@ -126,10 +127,10 @@ class ArmingActions(VehicleBase):
     ) -> None:
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
-        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), aerokit changes it first. In
-        AUTO, ArduCopter's parameter AUTO_OPTIONS decides: after a refusal, aerokit changes the mode and sends the
-        command a second time. Otherwise it sends the command only once, because a repetition might arm a vehicle that a
-        pilot has just disarmed.
+        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), aerokit changes it first.
+        ArduCopter's parameter AUTO_OPTIONS decides whether it arms in AUTO. If ArduCopter refuses in AUTO, aerokit
+        changes the mode and sends the command a second time. In all other cases, aerokit sends the command only once,
+        because a repetition might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
@@ -192,7 +193,7 @@ class ArmingActions(VehicleBase):
                 self._arbiter.latest(STEERING) is order_before
                 and self._arbiter.arm_commands_sent == arm_commands_before + 1
             )
-            has_open_stream = self._flight_cleanup.stop_stream is not None  # It needs the mode that it has set.
+            has_open_stream = self._flight_cleanup.stop_stream is not None  # A stream needs its own mode.
             may_retry_in_other_mode = (
                 may_change_mode
                 and not has_computer_slept

@@ -95,7 +95,7 @@ class BackgroundTask:
 # Seconds to wait for the acknowledgement of a hold at the end of the vehicle's `async with` block.
 HOLD_CLOSE_TIMEOUT_S = 1.5
 
-# Maximum number of holds for one abandoned order. Each further one follows a HEARTBEAT, after a time-out.
+# Maximum number of attempts to hold after an abandoned order. After a time-out, the next attempt waits for a HEARTBEAT.
 MAX_HOLD_ATTEMPTS = 3
 
 # A hold that was sent without waiting is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most

@@ -271,8 +271,8 @@ class FlightActions(VehicleBase):
             # Messages from before the order may be outdated.
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
-            # A submarine "lands" by going to the surface. Most submarines do not report a global position. Without one,
-            # the mode change alone shows that they have surfaced.
+            # A submarine "lands" by going to the surface. Most submarines do not report a global position. Without a
+            # position, the mode change alone counts.
             has_surfaced = has_left_surfacing_mode() and not is_deep()
             return ground.confirms(is_disarmed or is_landed or has_surfaced)
 
@@ -395,7 +395,7 @@ class ModeActions(VehicleBase):
             return ""
         if not order.has_lost_mode:  # Without a mode change, only a failsafe is a takeover.
             return order.failsafe
-        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # also if it is unknown
+        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # or unknown
         awaits_heartbeat = self.telemetry.armed.updated_at < order.mode_lost_at
         if may_have_landed and awaits_heartbeat:
             # PX4 leaves LAND when it disarms. CURRENT_MODE may report the new mode before HEARTBEAT reports that the

@@ -22,7 +22,7 @@ A vehicle whose motors stop while it climbs is slower than SETTLED_M_S for 0.4 s
 """
 
 STANDING_S, STANDING_M = 5.0, 2.0
-"""A vehicle whose height changes by less than STANDING_M metres in STANDING_S seconds is on the ground.
+"""A vehicle reported on the ground is there if its height changes by at most STANDING_M metres in STANDING_S seconds.
 
 This applies whatever velocity the vehicle reports, because the velocity may be wrong.
 """
@@ -106,8 +106,9 @@ class ImpactDetector:
             self._max_sink_m_s = max(max_sink_before_m_s, velocity.down_m_s)
             self._sank_fast_at = updated_at
         elif has_stopped_suddenly:
+            drop_m = None if self._top_m is None or height_m is None else self._top_m - height_m
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
-            if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
+            if drop_m is None or drop_m >= MIN_DROP_M:
                 self._impact_m_s = self._max_sink_m_s
                 # Even an old height is needed, so that a later height can show that the vehicle flies on.
                 self._impact_height_m = height_above_home(self._telemetry)

@@ -27,7 +27,7 @@ PREARM_REPORT_DURATION_S = 3.0
 CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 """The reason for a refusal to arm if no other reason is known."""
 REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
-"""Beginnings of reasons about missing or old reports, without which it is unknown whether the vehicle can arm."""
+"""Beginnings of the reasons about missing or old reports that show whether the vehicle can arm."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 

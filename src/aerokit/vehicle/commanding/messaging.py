@@ -96,12 +96,12 @@ async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: 
         monitor.reset()
         with anyio.move_on_after(retry_interval_s):
             await monitor.must_request.wait()
-            retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
-            continue  # An event has occurred, so the streams are requested again at once.
-        retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
         if monitor.has_received:  # The vehicle streams, so only an event requires a new request.
             await monitor.must_request.wait()
+        if monitor.must_request.is_set():
             retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
+        else:
+            retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
 
 
 async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: ExitStack) -> None:
@@ -261,19 +261,24 @@ class MessagingActions(VehicleBase):
         """
         target = getattr(message, "target_system", self.system_id)  # All steering messages have this field.
         subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
+        if not subjects:
+            return
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
             self._arbiter.record_own_arming(message.param1 == 1)
-        elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
-            names = self.telemetry.mode_names
-            modes: tuple[Mode, ...] = ()  # An empty tuple means that any mode may be the effect.
-            if isinstance(message, (CommandInt, CommandLong)):
-                params = (message.param1, message.param2, message.param3, message.param4)
-                modes = self.autopilot.modes_of_command(message.command, params, names)
-            elif message.base_mode & CUSTOM_MODE_ENABLED:
-                modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
-            self._arbiter.raw_order(subjects, modes=modes).was_sent = True
-        elif subjects:  # Set-points and mission messages end posted orders, but not the action in progress.
+        elif isinstance(message, (CommandInt, CommandLong, SetMode)):
+            order = self._arbiter.raw_order(subjects, modes=self._modes_of(message))
+            order.was_sent = True
+        else:  # Set-points and mission messages end posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
+
+    def _modes_of(self, message: CommandInt | CommandLong | SetMode) -> tuple[Mode, ...]:
+        """Return the modes to which the message may change; an empty tuple if that may be any mode."""
+        names = self.telemetry.mode_names
+        if isinstance(message, SetMode):
+            has_custom_mode = message.base_mode & CUSTOM_MODE_ENABLED
+            return (self.autopilot.mode(message.custom_mode, message.base_mode, names),) if has_custom_mode else ()
+        params = (message.param1, message.param2, message.param3, message.param4)
+        return self.autopilot.modes_of_command(message.command, params, names)
 
     @contextmanager
     def posted(

@@ -43,7 +43,7 @@ HIT_GROUND = "the vehicle hit the ground"
 """Beginning of each clause about an impact."""
 
 FALL_STOP_S = 1.5
-"""A vehicle on the ground has fallen if it stood still at most this many seconds after a fast descent."""
+"""A vehicle on the ground has fallen if it came to rest at most this many seconds after a fast descent."""
 
 
 async def await_progress(

@@ -72,7 +72,7 @@ class RoundFlight:
         self._counter = counter
         self._rounds = math.inf if rounds is None else rounds
         self._limits = limits
-        # Why the vehicle does not fly the ordered circle; empty if it does. `fly_by_command` orders a hold for it.
+        # Why the vehicle does not fly the ordered circle, so that `fly_by_command` must order a hold; empty if it does.
         self._circle_problem = ""
         position = context.vehicle_position
         # The center as arguments of a COMMAND_INT.
@@ -99,7 +99,7 @@ class RoundFlight:
         stay_s: float = 0.0,
         radius_m: float = 0.0,
     ) -> None:
-        """Send the command. Return ``stay_s`` seconds after the last round, or after the arrival without rounds.
+        """Send the command. Returns ``stay_s`` seconds after the last round; without rounds, after the arrival.
 
         With ``holds_at_end``, aerokit then orders a hold. Otherwise the vehicle stays, circling or hovering.
         ``radius_m`` is the ordered radius; 0 if the command has none.

@@ -97,7 +97,7 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for a recent HEARTBEAT. Called before a command of ``order``; None before the first one.
+        """Wait for a recent HEARTBEAT. Pass ``order`` if one of its commands was already sent.
 
         Raises OperationRejected if the order has ended or the computer slept, and HeartbeatTimeout if there is no
         HEARTBEAT for ``MAX_SILENCE_S``.

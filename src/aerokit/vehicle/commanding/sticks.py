@@ -124,13 +124,19 @@ class StickStream(SteeringStream[StickInput]):
 
     async def _check_support(self) -> None:
         if self._session.autopilot.name == "PX4":
-            source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
-            if source in (RC_ONLY, DISABLED):
-                raise OperationRejected(
-                    f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set COM_RC_IN_MODE to 1"
-                    " (MAVLink only) or 3 (transmitter or MAVLink)"
-                )
-            return
+            await self._check_px4_parameters()
+        else:
+            await self._check_ardupilot_parameters()
+
+    async def _check_px4_parameters(self) -> None:
+        source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
+        if source in (RC_ONLY, DISABLED):
+            raise OperationRejected(
+                f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set COM_RC_IN_MODE to 1"
+                " (MAVLink only) or 3 (transmitter or MAVLink)"
+            )
+
+    async def _check_ardupilot_parameters(self) -> None:
         values = await known_values(self._probe, "MAV_GCS_SYSID", "SYSID_MYGCS", "RC_OVERRIDE_TIME", "RC_OPTIONS")
         own_id = self._session.connection.source_system
         # Older versions of ArduPilot have SYSID_MYGCS instead of MAV_GCS_SYSID.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.connection.exchanges import ExchangeRun
 from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed
@@ -31,6 +31,17 @@ PENDING_ACK_TIMEOUT_S = 2.0
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""
+
+
+class _Options(NamedTuple):
+    """How a command is sent; see :meth:`CommandSender.send_long`."""
+
+    attempts: int | None
+    attempt_timeout: float | None
+    progress_timeout: float
+    on_progress: Callable[[int | None], None] | None
+    order_status: OrderStatus | None
+    was_just_sent: bool = False
 
 
 class CommandSender:
@@ -101,8 +112,8 @@ class CommandSender:
         """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
-        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status)
-        return await self._run(message, *options, was_just_sent=was_just_sent)
+        options = _Options(attempts, attempt_timeout, progress_timeout, on_progress, order_status, was_just_sent)
+        return await self._run(message, options)
 
     async def send_int(
         self,
@@ -122,8 +133,8 @@ class CommandSender:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
         target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
-        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status)
-        return await self._run(message, *options)
+        options = _Options(attempts, attempt_timeout, progress_timeout, on_progress, order_status)
+        return await self._run(message, options)
 
     async def send_place(
         self,
@@ -189,19 +200,11 @@ class CommandSender:
         # A rebooted vehicle may support other commands.
         self._results.clear()
 
-    async def _run(
-        self,
-        message: CommandLong | CommandInt,
-        attempts: int | None,
-        attempt_timeout: float | None,
-        progress_timeout: float,
-        on_progress: Callable[[int | None], None] | None,
-        order_status: OrderStatus | None,
-        was_just_sent: bool = False,
-    ) -> CommandAck:
+    async def _run(self, message: CommandLong | CommandInt, options: _Options) -> CommandAck:
         """Send a command and return its ACCEPTED ack. Waits for earlier calls of the same command."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
+        order_status, was_just_sent = options.order_status, options.was_just_sent
         self._abort_run_of_ended_order(key)
         # A caller may send a command for an order that has already ended. If the order ends later, while this call
         # waits for the lock, the command is not sent.
@@ -224,11 +227,11 @@ class CommandSender:
                 message,
                 own_system=self._connection.source_system,
                 own_component=self._connection.source_component,
-                attempts=attempts,
-                attempt_timeout=attempt_timeout,
+                attempts=options.attempts,
+                attempt_timeout=options.attempt_timeout,
                 min_timeout_s=self._min_attempt_timeout_s(),
-                progress_timeout=progress_timeout,
-                on_progress=on_progress,
+                progress_timeout=options.progress_timeout,
+                on_progress=options.on_progress,
                 earlier_answers=len(pending_acks),
                 acks_per_sending=acks_per_sending,
                 order_status=order_status,

@@ -100,6 +100,11 @@ class _Stream:
         self.counts_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
         self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
 
+    def postpone(self, now: float) -> None:
+        """Wait longer before the next request, because this one was not answered."""
+        self.failures += 1
+        self.next_attempt_at = now + min(2**self.failures, MAX_RETRY_INTERVAL_S)
+
     def on_frame(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
             self.received += 1
@@ -237,9 +242,7 @@ class MessageRates:
         except CommandTimeout:
             # A failure from before a call of `request_again` does not count.
             if reset_count == self._reset_count:
-                stream.failures += 1
-                interval_s = min(2**stream.failures, MAX_RETRY_INTERVAL_S)
-                stream.next_attempt_at = self._connection.now() + interval_s
+                stream.postpone(self._connection.now())
             return
         if reset_count != self._reset_count:
             # `request_again` was called meanwhile. The answer may be from before a reboot, so the stream stays due.

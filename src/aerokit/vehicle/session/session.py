@@ -361,6 +361,19 @@ class VehicleSession:
         self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
 
     def _attach_telemetry(self) -> None:
+        bus = self.connection.bus
+        self._attach_messages()
+        self._attach_watched_streams()
+        self.add_timeout_hint(*self.telemetry.cells.values(), self.link_quality, self.watch.link_state)
+        self._detach_callbacks += [
+            *self._publish_changes(),
+            bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
+            bus.attach_event(LinkSelected, self._on_link_selected),
+            bus.attach_event(ComputerSlept, self._on_computer_slept),
+            self.connection.on_end(self._on_end),
+        ]
+
+    def _attach_messages(self) -> None:
         bus, streams = self.connection.bus, self.telemetry.streams
         for message_id, handler in self.telemetry.handles.items():
             message_type = bus.dialect.get(message_id)
@@ -371,10 +384,11 @@ class VehicleSession:
             else:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self._detach_callbacks.append(detach)
+
+    def _publish_changes(self) -> list[Detach]:
+        """Publish changes of states as events, until the returned functions are called."""
         telemetry, publish = self.telemetry, self.publish
-        self._attach_watched_streams()
-        self.add_timeout_hint(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
-        self._detach_callbacks += [
+        return [
             telemetry.mode.observe(
                 lambda before, mode: publish(ModeChanged, None if before is None else before.name, mode.name)
             ),
@@ -383,10 +397,6 @@ class VehicleSession:
             telemetry.status_text.observe(
                 lambda _, text: publish(StatusTextReceived, text.severity, text.text), every_arrival=True
             ),
-            bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
-            bus.attach_event(LinkSelected, self._on_link_selected),
-            bus.attach_event(ComputerSlept, self._on_computer_slept),
-            self.connection.on_end(self._on_end),
         ]
 
     def _attach_watched_streams(self) -> None:
