@@ -301,7 +301,7 @@ class CommandArbiter:
 
     @property
     def is_flown_by_program(self) -> bool:
-        """True if an armed vehicle executes orders of this program."""
+        """True if the vehicle executes orders of this program, provided that it is armed."""
         order = self.current
         if order is None or order.takeover_reason or order.failsafe:
             return False
@@ -310,10 +310,7 @@ class CommandArbiter:
 
     @property
     def current(self) -> Order | None:
-        """The newest steering order since the vehicle armed. If there is none, an order that stands for the arming.
-
-        None if another party armed the vehicle, and the program has given no steering order since.
-        """
+        """The newest steering order since the vehicle armed. If there is none, ``_arming_order``."""
         newest = self.newest
         return newest if newest is not None and newest.given_at >= self._last_arming_at else self._arming_order
 

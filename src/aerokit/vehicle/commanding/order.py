@@ -312,7 +312,7 @@ class SentCommand:
 
     The command may be sent again while the vehicle has reported neither the command's effect nor an action of another
     party. The effect is a change to one of ``modes`` or to ``armed``; ``is_done`` reports any other effect. ``slept_s``
-    returns for how many seconds the computer was suspended since the first transmission.
+    returns how many seconds the computer has slept since the first transmission.
     """
 
     def __init__(

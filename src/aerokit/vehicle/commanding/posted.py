@@ -132,7 +132,7 @@ class PostedOrder:
             return
 
     async def _is_valid_at_next_heartbeat(self, timeout: float) -> bool:
-        """Return False if the order has ended by then, or if no HEARTBEAT arrives in time."""
+        """Wait for the next HEARTBEAT. Return False if the order has ended, or if no HEARTBEAT arrives in time."""
         started_at, armed = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(MODE_RETRY_INTERVAL_S)
         with (

@@ -314,7 +314,7 @@ class VehiclePosition:
         return -math.inf if here is None or here.altitude_amsl_m is None else here.altitude_amsl_m
 
     def home_altitude(self) -> float:
-        """Return the altitude above mean sea level in metres. Raises ValueUnknownError if it is unknown."""
+        """Return home's altitude above mean sea level in metres. Raises ValueUnknownError if it is unknown."""
         return self._telemetry.home.value.altitude_amsl_m
 
     def global_target(self, target: Position, name: str = "target") -> tuple[int, int, float, MavFrame]:
@@ -353,7 +353,7 @@ class VehiclePosition:
         return target.replace(altitude_relative_m=None, altitude_amsl_m=altitude_m)
 
     def command_place(self, target: Position, name: str = "target") -> dict[str, Any]:
-        """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""
+        """Return the target as arguments of a COMMAND_INT; see :meth:`global_target`."""
         latitude, longitude, altitude, frame = self.global_target(target, name)
         return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 

@@ -143,16 +143,10 @@ class RoundFlight:
         def failure_reason() -> str | None:
             if reason := mode_failure():
                 return reason
-            texts = session.telemetry.texts_since(order.given_at)
-            refusals = (
-                text.text
-                for text in texts
-                # A later refusal is about something else, e.g. a mission that another ground station uploads.
-                if text.at <= started + CIRCLE_REPORT_S and session.autopilot.is_refusal(text.text)
-            )
+            refusal = self._first_refusal(order.given_at, started + CIRCLE_REPORT_S)
             # For a moment, PX4 may still report the previous circle.
             is_radius_reported = session.connection.now() > started + CIRCLE_REPORT_S
-            self._circle_problem = next(refusals, wrong_radius if is_radius_reported else "")
+            self._circle_problem = refusal or (wrong_radius if is_radius_reported else "")
             return self._circle_problem or None
 
         def stall_reason() -> str | None:
@@ -174,6 +168,12 @@ class RoundFlight:
             )
         finally:
             detach()
+
+    def _first_refusal(self, since: float, until: float) -> str:
+        """Return the first status text in this time that refuses the circle; empty if there is none."""
+        # A later refusal is about something else, e.g. a mission that another ground station uploads.
+        texts = [text.text for text in self._telemetry.texts_since(since) if text.at <= until]
+        return next(filter(self._session.autopilot.is_refusal, texts), "")
 
     def _are_rounds_flown(self, started: float) -> bool:
         is_known = self._context.vehicle_position.was_received_since(started)

@@ -185,7 +185,7 @@ class SimpleOrder(Snapshot):
         target: int,
         timeout: float,
     ) -> None:
-        """Request ``effect.message`` until it reports the effect, or until the vehicle refuses to send it.
+        """Request ``effect.message`` until it reports the effect. Returns early if the vehicle does not send it at all.
 
         ``target`` is the id of the component that sends the message.
         """

@@ -292,15 +292,18 @@ class SteeringStream(ValueStream[ValueT]):
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stop_error
         elif not self._session.telemetry.is_confirmed_disarmed:
-            cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
-            order = self._context.arbiter.order(hold_mode)
-            try:
-                with cleanup.flying(order):
-                    await cleanup.stop_in(hold_mode, order)
-            except (anyio.get_cancelled_exc_class(), OperationTimeout):
-                # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
-                cleanup.hold_in_background(order)
-                raise
+            await self._hold_and_wait()
+
+    async def _hold_and_wait(self) -> None:
+        cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
+        order = self._context.arbiter.order(hold_mode)
+        try:
+            with cleanup.flying(order):
+                await cleanup.stop_in(hold_mode, order)
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
+            cleanup.hold_in_background(order)
+            raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
         if self._needs_stream_before_mode:  # PX4 enters the mode only while it receives values.

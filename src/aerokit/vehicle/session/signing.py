@@ -26,7 +26,7 @@ TIMESTAMP_TICKS_PER_S = 100_000
 
 
 async def set_up_signing(session: VehicleSession, signing: Signing | None, timeout: float) -> None:
-    """Send SETUP_SIGNING until the vehicle signs with the key, or no longer signs."""
+    """Send SETUP_SIGNING until the vehicle signs with the key. With None, until the vehicle no longer signs."""
     _check_vehicle(session)
     connection, started = session.connection, session.connection.now()
     with connection._gate.key_handover(signing, session.system_id, session.component_id) as has_accepted:
