@@ -61,8 +61,8 @@ class Guided:
 
     All streams have the same arguments. ``rate_hz`` (2 to 400) is the transmission rate of the latest set-point. The
     stream stops if it gets no new set-point for ``valid_for_s`` seconds, or if the event loop is late by ``max_lag_s``
-    seconds. A kind of set-point that this type of vehicle does not support raises NotSupported. Rates and seconds are
-    in real time: a simulation at ten times the speed needs ten times the rate.
+    seconds. NotSupported is raised for a kind of set-point that this type of vehicle does not support. Rates and
+    seconds are in real time: a simulation at ten times the speed needs ten times the rate.
     """
 
     def __init__(self, context: VehicleContext) -> None:
