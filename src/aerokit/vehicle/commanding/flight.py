@@ -267,15 +267,6 @@ class FlightActions(VehicleBase):
         landing_failure = self._sender.landing_failure(order)
         ground = GroundCheck(self._session)
 
-        def is_down() -> bool:
-            # Messages from before the order may be outdated.
-            is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
-            is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
-            # A submarine "lands" by going to the surface. Most submarines do not report a global position. Without a
-            # position, the mode change alone counts.
-            has_surfaced = has_left_surfacing_mode() and not is_deep()
-            return ground.confirms(is_disarmed or is_landed or has_surfaced)
-
         def has_left_surfacing_mode() -> bool:
             return self.telemetry.mode_name == self.autopilot.mode_when_landed and mode.updated_at > accepted_at
 
@@ -284,6 +275,15 @@ class FlightActions(VehicleBase):
                 self._position.was_received_since(order.given_at)
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
+
+        def is_down() -> bool:
+            # Messages from before the order may be outdated.
+            is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
+            is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
+            # A submarine "lands" by going to the surface. Most submarines do not report a global position. Without a
+            # position, the mode change alone counts.
+            has_surfaced = has_left_surfacing_mode() and not is_deep()
+            return ground.confirms(is_disarmed or is_landed or has_surfaced)
 
         def failure_reason() -> str | None:
             if has_left_surfacing_mode() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:

@@ -97,30 +97,34 @@ class ImpactDetector:
         interval_s = min(updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = updated_at
-        height_m = self.current_height()
-        sinks_fast = velocity.down_m_s >= IMPACT_M_S
         has_just_sunk_fast = updated_at - self._sank_fast_at <= max_stop_s
-        has_stopped_suddenly = has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S
-        if sinks_fast:
-            max_sink_before_m_s = self._max_sink_m_s if has_just_sunk_fast else 0.0
-            self._max_sink_m_s = max(max_sink_before_m_s, velocity.down_m_s)
-            self._sank_fast_at = updated_at
-        elif has_stopped_suddenly:
-            drop_m = None if self._top_m is None or height_m is None else self._top_m - height_m
-            # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
-            if drop_m is None or drop_m >= MIN_DROP_M:
-                self._impact_m_s = self._max_sink_m_s
-                # Even an old height is needed, so that a later height can show that the vehicle flies on.
-                self._impact_height_m = height_above_home(self._telemetry)
+        if velocity.down_m_s >= IMPACT_M_S:
+            self._on_fast_descent(velocity.down_m_s, is_continued=has_just_sunk_fast)
+        elif has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S:
+            self._on_sudden_stop()
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.
             self._impact_m_s = None
             self._impact_height_m = None
         # While the vehicle does not sink, its height is the one before the next descent.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
-            self._top_m = height_m
+            self._top_m = self.current_height()
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_slowed = self._impact_m_s is not None and (self._has_slowed or is_slow)
+
+    def _on_fast_descent(self, sink_m_s: float, *, is_continued: bool) -> None:
+        max_sink_before_m_s = self._max_sink_m_s if is_continued else 0.0
+        self._max_sink_m_s = max(max_sink_before_m_s, sink_m_s)
+        self._sank_fast_at = self._updated_at
+
+    def _on_sudden_stop(self) -> None:
+        height_m = self.current_height()
+        drop_m = None if self._top_m is None or height_m is None else self._top_m - height_m
+        # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
+        if drop_m is None or drop_m >= MIN_DROP_M:
+            self._impact_m_s = self._max_sink_m_s
+            # Even an old height is needed, so that a later height can show that the vehicle flies on.
+            self._impact_height_m = height_above_home(self._telemetry)
 
     def describe(self) -> str:
         """Return a text about the impact; empty if there was none."""

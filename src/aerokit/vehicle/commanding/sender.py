@@ -301,12 +301,13 @@ class OrderSender:
             if self._session.connection.now() < settles_at:  # The mode of an abandoned order may still be reported.
                 return None
             mode = self._session.telemetry.mode.latest
-            was_in_mode = was_in_mode or mode in modes
-            if mode not in modes and was_in_mode:
+            if mode in modes:
+                was_in_mode = True
+                return None
+            if was_in_mode:
                 return f"the mode changed to {mode}"
-            if mode not in modes and self._session.connection.now() > grace_until:
-                return f"the vehicle stayed in {mode}"
-            return None
+            has_grace_ended = self._session.connection.now() > grace_until
+            return f"the vehicle stayed in {mode}" if has_grace_ended else None
 
         return failure_reason
 

@@ -283,6 +283,12 @@ class CommandSender:
         for run in tuple(self._runs.values()):
             run.abort(error)
 
+    def _record_result(self, key: _Key, ack: CommandAck) -> None:
+        self._results[key] = ack.result
+        # An ack without a target may be for another ground station, so `accepted_at` ignores it.
+        if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
+            self._accepted_at[key] = self._connection.now()
+
     def _on_ack(self, ack: CommandAck) -> None:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
@@ -290,10 +296,7 @@ class CommandSender:
         is_final = ack.result != MavResult.IN_PROGRESS
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and is_final:
-            self._results[key] = ack.result
-            # An ack without a target may be for another ground station, so `accepted_at` ignores it.
-            if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
-                self._accepted_at[key] = self._connection.now()
+            self._record_result(key, ack)
         if run is not None:
             run.receive(ack)
         elif is_answer and is_final:

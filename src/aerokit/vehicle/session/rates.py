@@ -110,6 +110,13 @@ class _Stream:
             self.received += 1
 
 
+def _is_slow(achieved_hz: float, requested_hz: float) -> bool:
+    window_s = WATCH_WINDOW * WATCH_PERIOD_S
+    received_messages = achieved_hz * window_s
+    # One message may be missing, because it may have arrived just outside the window.
+    return received_messages < SLOW_FACTOR * requested_hz * window_s - 1
+
+
 class MessageRates:
     """Makes one component send the requested messages, each at the highest requested rate.
 
@@ -333,13 +340,8 @@ class MessageRates:
         has_just_started = achieved_hz > 0 and stream.counts_at_checks[0] == stream.counts_at_checks[1]
         if has_just_started and not stream.is_slow:
             return
-        # A stream that lacks only one message is not slow, because that message may have arrived just outside the
-        # window.
-        window_s = WATCH_WINDOW * WATCH_PERIOD_S
-        min_messages = SLOW_FACTOR * stream.requested_hz * window_s - 1
-        received_messages = achieved_hz * window_s
         was_slow = stream.is_slow
-        stream.is_slow = received_messages < min_messages
+        stream.is_slow = _is_slow(achieved_hz, stream.requested_hz)
         if stream.is_slow and not was_slow:
             self._connection.bus.publish(
                 StreamSlow(
