@@ -1352,8 +1352,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG of this order. Returns at the acknowledgement, or when the order's effect is reported.
 
-        The command is not sent again after a newer order about the same subject, or after another party changed the
-        mode.
+        After a newer order about the same subject, or after another party changed the mode, aerokit does not send the
+        command again.
 
         Args:
             command: the MAV_CMD.
@@ -4517,9 +4517,9 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), aerokit changes it first.
-        ArduCopter's parameter AUTO_OPTIONS decides whether it arms in AUTO. If ArduCopter refuses in AUTO, aerokit
-        changes the mode and sends the command a second time. In all other cases, aerokit sends the command only once,
-        because a repetition might arm a vehicle that a pilot has just disarmed.
+        ArduCopter's parameter AUTO_OPTIONS decides whether it arms in AUTO. If ArduCopter refuses in AUTO, and ``mode``
+        is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
+        command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
@@ -4637,13 +4637,13 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Fly circles around a place.
 
-        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
-        Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
-        orders the vehicle to hold.
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times. Afterwards a
+        multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders the
+        vehicle to hold.
 
         PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
-        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. aerokit therefore
-        streams set-points in GUIDED, and the vehicle stops if your program dies.
+        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. For ArduCopter, aerokit
+        therefore streams set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
@@ -5048,8 +5048,8 @@ class Vehicle(VehicleTwin):
     def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Land at the present position. Returns when the vehicle is on the ground.
 
-        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
-        vehicle continues to land.
+        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation,
+        the vehicle continues to land.
 
         Args:
             timeout: seconds until the vehicle is on the ground; None: no limit.

@@ -128,9 +128,9 @@ class ArmingActions(VehicleBase):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), aerokit changes it first.
-        ArduCopter's parameter AUTO_OPTIONS decides whether it arms in AUTO. If ArduCopter refuses in AUTO, aerokit
-        changes the mode and sends the command a second time. In all other cases, aerokit sends the command only once,
-        because a repetition might arm a vehicle that a pilot has just disarmed.
+        ArduCopter's parameter AUTO_OPTIONS decides whether it arms in AUTO. If ArduCopter refuses in AUTO, and ``mode``
+        is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
+        command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring

@@ -207,8 +207,8 @@ class FlightActions(VehicleBase):
     async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Land at the present position. Returns when the vehicle is on the ground.
 
-        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
-        vehicle continues to land.
+        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation,
+        the vehicle continues to land.
 
         Args:
             timeout: seconds until the vehicle is on the ground; None: no limit.

@@ -53,7 +53,7 @@ class Health:
         self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly. Sends nothing."""
+        """Return what the vehicle still needs for a flight. Sends nothing."""
         telemetry = self._telemetry
         missing = [
             f"{cell.name} ({cell.waits_for} not received)"

@@ -53,13 +53,13 @@ class ManeuverActions(VehicleBase):
     ) -> None:
         """Fly circles around a place.
 
-        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
-        Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
-        orders the vehicle to hold.
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times. Afterwards a
+        multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders the
+        vehicle to hold.
 
         PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
-        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. aerokit therefore
-        streams set-points in GUIDED, and the vehicle stops if your program dies.
+        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. For ArduCopter, aerokit
+        therefore streams set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,

@@ -59,8 +59,8 @@ class PostedOrder:
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG of this order. Returns at the acknowledgement, or when the order's effect is reported.
 
-        The command is not sent again after a newer order about the same subject, or after another party changed the
-        mode.
+        After a newer order about the same subject, or after another party changed the mode, aerokit does not send the
+        command again.
 
         Args:
             command: the MAV_CMD.
