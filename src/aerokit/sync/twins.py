@@ -537,8 +537,8 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[BodyVelocitySetpoint]:
         """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
 
-        With ``yaw_deg`` on ArduPilot, "forward" is the direction of the vehicle's nose at the time of ``set``, and
-        stays so while the vehicle turns. Therefore call ``set`` often during a turn.
+        With ``yaw_deg`` on ArduPilot, the velocity does not turn with the vehicle: "forward" stays the direction of the
+        vehicle's nose at the time of ``set``. Therefore call ``set`` often during a turn.
         """
         return SetpointStream(
             self._loop,
@@ -630,7 +630,7 @@ class Guided(TwinOf["AsyncGuided"]):
         """Stream body rates with thrust to ArduCopter or PX4 (SET_ATTITUDE_TARGET without an attitude).
 
         Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`. The
-        autopilot does not level the vehicle: it keeps turning at these rates until the next set-point. Without a new
+        autopilot does not level the vehicle, which keeps turning at these rates until the next set-point. Without a new
         set-point for ``valid_for_s``, aerokit orders a hold.
         """
         return SetpointStream(
@@ -692,9 +692,9 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. After a newer order, or a
     takeover by a pilot or a failsafe, the stream sends nothing more, not even the hold.
 
-    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but not because the vehicle does not
-    move. It also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or
-    raises, or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or
+    The stream stops by itself for the same reasons as a :class:`SetpointStream`, except that the vehicle may stay in
+    place. It also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends
+    or raises, or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or
     else the end of the block, raises :class:`SetpointStreamStopped`.
 
     Entering raises:
@@ -702,7 +702,8 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
         OperationTimeout: no position of the target was known within ``valid_for_s``.
         InvalidArgument: ``height_m`` was given, but the target has no altitude.
 
-    After these errors, a flying vehicle is ordered to hold if it was still executing an earlier order of the program.
+    After these errors, aerokit orders a flying vehicle to hold if it was still executing an earlier order of the
+    program.
     """
 
     @property
@@ -733,16 +734,16 @@ class StickStream(BlockTwin["AsyncStickStream"]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
     Entering the block sends the initial positions for a second and then changes the mode. Leaving the block, also
-    by an exception, orders the vehicle to hold, except after a newer order or a takeover. ArduPilot is also told to
+    by an exception, orders the vehicle to hold, except after a newer order or a takeover. It also makes ArduPilot
     release the sticks. If the stream stops by itself (no new positions, a blocked event loop, a silent vehicle,
     another mode), the next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s). ArduCopter without a
     transmitter executes the action of FS_THR_ENABLE after every end of a stream.
 
-    PX4 has no message that releases the sticks. COM_RC_LOSS_T (0.5 s) after every end of a stream, it treats the sticks
-    as lost. Without another source of manual control, it then executes NAV_RCL_ACT (return by default), even in hold
-    mode unless bit 1 of COM_RCL_EXCEPT is set.
+    PX4 has no message that releases the sticks. After every end of a stream, it waits for COM_RC_LOSS_T (0.5 s) and
+    then treats the sticks as lost. Without another source of manual control, it executes NAV_RCL_ACT (return by
+    default). To prevent this in hold mode, set bit 1 of COM_RCL_EXCEPT.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
@@ -1355,8 +1356,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG of this order. Returns at the acknowledgement, or when the order's effect is reported.
 
-        The command is not sent again after a newer order about the same subject, or after another party changed the
-        mode.
+        After a newer order about the same subject, or after another party changed the mode, aerokit does not send the
+        command again.
 
         Args:
             command: the MAV_CMD.
@@ -4146,9 +4147,8 @@ class Vehicle(VehicleTwin):
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time.
                 None: 3 for a request for data, 0 for all other commands, because a retry after a lost ack would execute
-                the command twice. If you allow retries for such a command, it is sent again only right after a
-                HEARTBEAT, and only if the mode has not changed, no failsafe is active and there is no newer order
-                (docs/reliability.md).
+                the command twice. aerokit retries a command other than a request only right after a HEARTBEAT, and only
+                if the mode has not changed, no failsafe is active and there is no newer order (docs/reliability.md).
             attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
                 trips if necessary. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
@@ -4236,23 +4236,23 @@ class Vehicle(VehicleTwin):
         modes: tuple[Mode, ...] = (),
         armed: bool | None = None,
     ) -> AbstractContextManager[PostedOrder]:
-        """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
+        """Open an order without waiting for its effect, so that orders for mode, arming and take-off can overlap.
 
-        In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
-        or their effect is reported. The retries also end in these cases:
+        In the ``with`` block, aerokit sends each command of the order again right after a HEARTBEAT, until the vehicle
+        acknowledges it or reports its effect. The retries also end in these cases:
 
-        - A newer order is given whose subjects include the first subject of this order.
-        - The mode changes, and neither this order nor any order of the ten seconds before it asked for the new mode. An
-          order to disarm is still retried.
-        - A failsafe becomes active. An order to land, to return or to disarm is still retried.
+        - You give a newer order about the first of ``subjects``.
         - The vehicle reboots or, if the first subject is ``"motion"``, disarms.
+        - A failsafe becomes active. This does not end an order to land, to return or to disarm.
+        - The mode changes to one that neither this order nor an order of the ten seconds before it asked for. This does
+          not end an order to disarm.
 
         If you leave the block early, aerokit neither makes the vehicle hold nor disarms it if it arms later. Use the
         actions for that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first one is mode or motion, the order also ends the
-                action in progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first subject is mode or motion, the order also ends
+                the action in progress.
             modes: the modes that the vehicle may change to because of the order.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
@@ -4292,7 +4292,7 @@ class Vehicle(VehicleTwin):
     def streams(self, rate_hz: float) -> AbstractContextManager[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        Use it for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
+        Use this for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
         gets REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no
         message arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit
         requests only those common states that are missing.
@@ -4361,7 +4361,7 @@ class Vehicle(VehicleTwin):
         return self.aio.describe_now()
 
     def texts_since(self, at: float) -> tuple[str, ...]:
-        """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
+        """Return the status texts (STATUSTEXT) received since ``at``, a time of the loop's clock, oldest first."""
         return self._loop.call(self.aio.texts_since, at)
 
     def autotune(self, *, timeout: float = 120.0, on_progress: Callable[[int], object] | None = None) -> None:
@@ -4485,11 +4485,11 @@ class Vehicle(VehicleTwin):
         return self.aio.taken_over
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
+        """Return what the vehicle still needs for a flight, according to the messages received so far. Sends nothing.
 
         If the vehicle's arming checks fail, the result includes the vehicle's status texts about them from the
-        last 35 s; :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in
-        STABILIZE without a position.
+        last 35 s; :meth:`why_not_armable` requests these texts. A vehicle that lacks something may still arm:
+        ArduCopter arms in STABILIZE without a position.
         """
         return self._loop.call(self.aio.missing_for_flight)
 
@@ -4512,8 +4512,8 @@ class Vehicle(VehicleTwin):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds. The text lists what is missing, recent status texts
-                and, at its end, a mode that does not allow arming. Three seconds before this error, a vehicle whose
-                pre-arm checks fail is asked for its reasons.
+                and, at its end, a mode that does not allow arming. If pre-arm checks fail, aerokit asks the vehicle for
+                the reasons three seconds before this error.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 
@@ -4528,10 +4528,10 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
-        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If ArduCopter refuses in AUTO, the mode is
-        changed and the command is sent a second time. Otherwise the command is sent only once, because a repetition
-        might arm a vehicle that a pilot has just disarmed.
+        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), aerokit changes it first.
+        ArduCopter's parameter AUTO_OPTIONS decides whether it arms in AUTO. If ArduCopter refuses in AUTO, and ``mode``
+        is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
+        command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
@@ -4649,13 +4649,13 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Fly circles around a place.
 
-        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
-        Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
-        orders the vehicle to hold.
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times. Afterwards a
+        multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders the
+        vehicle to hold.
 
         PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
-        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. aerokit therefore
-        streams set-points in GUIDED, and the vehicle stops if your program dies.
+        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. For ArduCopter, aerokit
+        therefore streams set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
@@ -4753,9 +4753,9 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Go to a place and stay there: a fixed wing circles, a multicopter hovers.
 
-        Returns when the vehicle has arrived and has then flown ``turns`` turns or waited ``duration_s`` seconds, if one
-        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders the
-        vehicle to hold where it is.
+        Returns when the vehicle has arrived, has then flown ``turns`` turns, and has then stayed for ``duration_s``
+        seconds; both are optional. The vehicle stays until another order. After a cancellation or a time-out, aerokit
+        orders the vehicle to hold where it is.
 
         Sends MAV_CMD_DO_REPOSITION (ArduPilot in GUIDED, PX4 in LOITER). For a PX4 fixed wing with ``radius_m``, sends
         MAV_CMD_DO_ORBIT.
@@ -4766,7 +4766,7 @@ class Vehicle(VehicleTwin):
                 (WP_LOITER_RAD, NAV_LOITER_RAD).
             clockwise: direction of the circle, as seen from above; only with ``radius_m``.
             turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
-            duration_s: return this many seconds after the arrival.
+            duration_s: return this many seconds after the arrival, or after the last turn.
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds in total. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle
                 moves.
@@ -4901,9 +4901,9 @@ class Vehicle(VehicleTwin):
     ) -> None:
         """Fly to a place and return on arrival.
 
-        After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
-        order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
-        next heartbeat.
+        After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is; a silent vehicle
+        gets the hold after its next heartbeat. aerokit does not order the hold if another order was given meanwhile, or
+        another party changed the mode.
 
         Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not support this command.
@@ -4912,7 +4912,7 @@ class Vehicle(VehicleTwin):
             target: latitude and longitude, and an altitude above the home of this vehicle or above mean sea level. If
                 it has both, the altitude above home is used. Caution: the position of another vehicle has an altitude
                 above the home of that vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the
-                present altitude is kept.
+                vehicle keeps its present altitude.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -4949,7 +4949,7 @@ class Vehicle(VehicleTwin):
         way.
 
         Raises:
-            InvalidArgument: an argument is out of range. Nothing was sent.
+            InvalidArgument: the speed is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
@@ -4974,7 +4974,7 @@ class Vehicle(VehicleTwin):
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
                 left. The vehicle turns the shorter way, but ArduPilot turns relative angles of ±170 to ±350 degrees in
                 the direction of their sign.
-            relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
+            relative: True to turn by an angle from the present heading; 360 and −360 cause no turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
@@ -5024,7 +5024,8 @@ class Vehicle(VehicleTwin):
     def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres; infinite while the position is unknown.
 
-        It is three-dimensional if both have an altitude of the same kind, otherwise along the ground.
+        The distance is three-dimensional if the vehicle's position and the target have an altitude of the same kind.
+        Otherwise it is measured along the ground.
         """
         return self.aio.distance_to(target)
 
@@ -5048,8 +5049,8 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, or it disarmed or
-                hit the ground, during the take-off.
+            OperationRejected: the vehicle is not armed, or is already flying (nothing was sent). Or during the
+                take-off, its mode changed, or it disarmed or hit the ground.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -5061,8 +5062,8 @@ class Vehicle(VehicleTwin):
     def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Land at the present position. Returns when the vehicle is on the ground.
 
-        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
-        vehicle continues to land.
+        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation,
+        the vehicle continues to land.
 
         Args:
             timeout: seconds until the vehicle is on the ground; None: no limit.

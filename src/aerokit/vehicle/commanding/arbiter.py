@@ -34,11 +34,12 @@ STEERING, ACTION = "steering", "action"
 
 
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
-    """Return True if the order that was accepted at ``accepted_at`` has armed the vehicle.
+    """Return True if the arm order that the vehicle accepted at ``accepted_at`` has armed it.
 
     ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed.
     """
-    # If HEARTBEAT reported disarmed after this delay, the order had no effect, and another party has armed the vehicle.
+    # A HEARTBEAT that reports disarmed after this delay shows that the order had no effect: another party has armed the
+    # vehicle later.
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
@@ -46,12 +47,12 @@ class CommandArbiter:
     """Keeps the orders to one vehicle, updates them with each HEARTBEAT, and knows the newest order about each topic.
 
     Every order of the program is registered here, whether it comes from a flight action, a set-point, a device, a fleet
-    or the classic API.
+    or the DroneKit API.
     """
 
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
-        # Returns for how many seconds since the given time the computer was suspended.
+        # Returns how many seconds the computer has slept since the given time.
         self.slept_since: Callable[[float], float] = lambda _: 0.0
         self.newest: Order | None = None
         """The last steering order given by an action or a raw command."""
@@ -66,24 +67,23 @@ class CommandArbiter:
         self.last_disarmed_report_at: float = -math.inf
         """Time of the last HEARTBEAT that reported disarmed."""
         self._last_arming_at = -math.inf  # time of the last change from disarmed to armed
-        # An order that stands for the last arming; None if another party armed the vehicle.
+        # Records a takeover or a failsafe since the program armed the vehicle; None if another party has armed it.
         self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
-        # Orders and commands whose `post` or `sending` block is active.
-        self._posted: list[Order] = []
-        # (time, mode) of each mode that HEARTBEAT may still report: the modes of orders that were replaced or whose
-        # block was left, and the mode after a mission.
+        self._posted: list[Order] = []  # orders whose `post` block is active
+        self._sent: list[SentCommand] = []  # commands whose `sending` block is active
+        # Modes that HEARTBEAT may still report although the order for them has ended, and the mode after a mission.
+        # Each has the time at which it was added.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
-        self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
-        self._open_mode_changes = 0  # number of `changing_mode` blocks that are open
-        self._doubted_change = 0  # number of the last mode change with an unknown result
-        self._confirmed_change = 0  # number of the last mode change that was confirmed
+        self._open_mode_changes = 0  # how many `changing_mode` blocks are open
+        self._doubted_change = 0  # sequence number of the last mode change with an unknown result
+        self._confirmed_change = 0  # sequence number of the last mode change that was confirmed
         # The newest order about each topic, even if it was withdrawn or has ended.
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()
-        # Time of the order and number of the mode, for the modes that the program ordered last.
+        # The modes that the program ordered last: time of the order, and number in HEARTBEAT.custom_mode.
         self._ordered_modes: deque[tuple[float, int]] = deque(maxlen=16)
         self._steering_callbacks: list[Callable[[], None]] = []
         telemetry.mode.observe(self._on_mode, every_arrival=True)
@@ -175,9 +175,8 @@ class CommandArbiter:
         for order in (*self._orders, *self._posted):
             order.on_reboot()
         self._ordered_since_disarmed.clear()
-        # Infinity makes `current` ignore all orders from before the reboot until the vehicle arms again.
         self._arming_order = None
-        self._last_arming_at = math.inf
+        self._last_arming_at = math.inf  # Until the vehicle arms again, `current` ignores all orders.
         self._arming_accepted_at = -math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
@@ -191,8 +190,8 @@ class CommandArbiter:
         A newer action ends the order, unless ``ends_with_actions`` is False: for a command that is sent only once, and
         for one that stops or releases a device.
 
-        With ``device_order``, the new order is a part of it: a newer order about the same device ends both. Raises
-        OperationRejected if a newer one was already given.
+        With ``device_order``, the new order is a part of that order: a newer order about the same device ends both.
+        Raises OperationRejected if ``device_order`` is not the newest one any more.
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
@@ -223,7 +222,7 @@ class CommandArbiter:
         if is_steering:
             self._notify_steering()
             for previous in (self.newest, self._arming_order):
-                if previous is not None:  # A change to a mode of the posted order is not a takeover.
+                if previous is not None:  # For it, a change to a mode of the posted order is not a takeover.
                     previous.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
@@ -269,7 +268,7 @@ class CommandArbiter:
             is_done=is_done,
             slept_s=partial(self.slept_since, self._now()),
         )
-        if order.armed is None and armed is not None:  # For a posted order, `post` has ended earlier ones.
+        if order.armed is None and armed is not None:  # If `order.armed` is set, `post` has done this already.
             self._supersede_arming(armed)
             order.arm_command = self.arm_commands_sent
         self._sent.append(sent)
@@ -313,7 +312,7 @@ class CommandArbiter:
 
     @property
     def is_flown_by_program(self) -> bool:
-        """True if an armed vehicle executes orders of this program."""
+        """True if the vehicle executes orders of this program, provided that it is armed."""
         order = self.current
         if order is None or order.takeover_reason or order.failsafe:
             return False
@@ -322,7 +321,7 @@ class CommandArbiter:
 
     @property
     def current(self) -> Order | None:
-        """The newest steering order since the vehicle armed; if there is none, the order that armed the vehicle."""
+        """The newest steering order since the vehicle armed. If there is none, ``_arming_order``."""
         newest = self.newest
         return newest if newest is not None and newest.given_at >= self._last_arming_at else self._arming_order
 
@@ -335,11 +334,12 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        # For an order without modes, a takeover is not certain: a raw command may itself have changed the mode. It is
-        # not certain either if a posted order is newer, because the vehicle may be executing that order.
-        was_taken_over = order is not None and bool(order.modes) and bool(order.takeover_reason) and order.is_newest
-        # Disarming clears `topics`. A takeover does not undo an order to arm.
-        return "arm" in topics if was_taken_over else bool(topics)
+        if order is not None and order.takeover_reason:
+            may_be_own_change = not order.modes  # A raw command without modes may have changed the mode itself.
+            has_newer_order = not order.is_newest  # The vehicle may be executing the newer order, which is posted.
+            if not may_be_own_change and not has_newer_order:
+                return "arm" in topics  # A takeover does not undo an order to arm.
+        return bool(topics)
 
     @property
     def is_state_recent(self) -> bool:

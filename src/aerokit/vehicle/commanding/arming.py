@@ -55,11 +55,11 @@ class ArmingActions(VehicleBase):
     """Arming, disarming and rebooting."""
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
+        """Return what the vehicle still needs for a flight, according to the messages received so far. Sends nothing.
 
         If the vehicle's arming checks fail, the result includes the vehicle's status texts about them from the
-        last 35 s; :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in
-        STABILIZE without a position.
+        last 35 s; :meth:`why_not_armable` requests these texts. A vehicle that lacks something may still arm:
+        ArduCopter arms in STABILIZE without a position.
         """
         return self._health.missing_for_flight()
 
@@ -82,8 +82,8 @@ class ArmingActions(VehicleBase):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds. The text lists what is missing, recent status texts
-                and, at its end, a mode that does not allow arming. Three seconds before this error, a vehicle whose
-                pre-arm checks fail is asked for its reasons.
+                and, at its end, a mode that does not allow arming. If pre-arm checks fail, aerokit asks the vehicle for
+                the reasons three seconds before this error.
         """
         telemetry = self.telemetry
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home, telemetry.armed)
@@ -102,19 +102,20 @@ class ArmingActions(VehicleBase):
                 else:
                     await changes.next(min(timeout, ask_at - self.connection.now()))
             return
-        # The time-out has expired.
+        # The time-out has expired. The vehicle may have become ready just after the last check.
+        if missing := self._health.missing_for_flight():
+            raise OperationTimeout(
+                f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:"
+                f"{self._list_reasons(missing)}"
+            )
+
+    def _list_reasons(self, missing: list[str]) -> str:
         recent_texts = self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S)
-        missing_now = self._health.missing_for_flight()
-        if not missing_now:  # The vehicle has become ready just after the last check.
-            return
-        reasons = self._session.deduplicate_reasons(*recent_texts, *missing_now)
-        missing = "".join(f"\n  - {reason}" for reason in reasons)
+        reasons = self._session.deduplicate_reasons(*recent_texts, *missing)
+        items = "".join(f"\n  - {reason}" for reason in reasons)
         # The mode does not count as missing, because `arm` changes it.
         mode_text = "".join(f"\n{text}" for text in self._health.unarmable_mode())
-        raise OperationTimeout(
-            f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:"
-            f"{missing}{mode_text}"
-        )
+        return f"{items}{mode_text}"
 
     async def arm(
         self,
@@ -127,10 +128,10 @@ class ArmingActions(VehicleBase):
     ) -> None:
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
-        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If ArduCopter refuses in AUTO, the mode is
-        changed and the command is sent a second time. Otherwise the command is sent only once, because a repetition
-        might arm a vehicle that a pilot has just disarmed.
+        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), aerokit changes it first.
+        ArduCopter's parameter AUTO_OPTIONS decides whether it arms in AUTO. If ArduCopter refuses in AUTO, and ``mode``
+        is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
+        command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
@@ -193,14 +194,13 @@ class ArmingActions(VehicleBase):
                 self._arbiter.latest(STEERING) is order_before
                 and self._arbiter.arm_commands_sent == arm_commands_before + 1
             )
+            has_open_stream = self._flight_cleanup.stop_stream is not None  # A stream needs its own mode.
             may_retry_in_other_mode = (
                 may_change_mode
                 and not has_computer_slept
                 and is_newest_order
-                # A set-point stream needs the mode that it has set. If another party has armed the vehicle meanwhile,
-                # the mode is not changed either.
-                and self._flight_cleanup.stop_stream is None
-                and self.telemetry.is_confirmed_disarmed
+                and not has_open_stream
+                and self.telemetry.is_confirmed_disarmed  # False if another party has armed the vehicle meanwhile.
                 and self._is_in_mode_armable_by_option()
             )
             other_mode = self.autopilot.mode_to_arm_in() if may_retry_in_other_mode else None
@@ -350,7 +350,7 @@ class ArmingActions(VehicleBase):
         if not force:
             self._session.check_disarmed("reboot")
         reboots_before = self._session.watch.reboots
-        # A reboot is detected by a time since boot that is shorter than before, so request the present one.
+        # aerokit detects a reboot by a decrease of the time since boot, so request the present time.
         self._session.link_watch.request_time()
         unanswered: CommandTimeout | OperationRejected | None = None
         with (
@@ -393,7 +393,7 @@ class ArmingActions(VehicleBase):
             now = self.connection.now()
             if now >= next_request_at:
                 self._session.link_watch.request_time()
-                # A reboot is detected by a time since boot that is shorter than before. A fast simulation soon exceeds
-                # the old time, so the requests are frequent at first.
+                # aerokit detects a reboot by a decrease of the time since boot. In a fast simulation, the time soon
+                # exceeds the old one, so the requests are frequent at first.
                 next_request_at = now + POLL_INTERVAL_S + (now - started) / 10
             await anyio.sleep(POLL_INTERVAL_S)

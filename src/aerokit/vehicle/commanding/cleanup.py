@@ -95,7 +95,7 @@ class BackgroundTask:
 # Seconds to wait for the acknowledgement of a hold at the end of the vehicle's `async with` block.
 HOLD_CLOSE_TIMEOUT_S = 1.5
 
-# Maximum number of attempts to hold a vehicle that was silent. The first attempt follows when the silence ends.
+# Maximum number of attempts to hold after an abandoned order. After a time-out, the next attempt waits for a HEARTBEAT.
 MAX_HOLD_ATTEMPTS = 3
 
 # A hold that was sent without waiting is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most
@@ -236,13 +236,15 @@ class FlightCleanup:
 
     @contextmanager
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
-        """Create an order to change to ``mode``. The caller prepares a stream in the block, and then sends the order.
+        """Create an order to change to ``mode``, for a stream that the caller prepares in the `with` block.
 
-        Raises BusyError if another stream is open. The end of the block raises OperationRejected if the order has
-        ended, and HeartbeatTimeout if the vehicle is silent.
+        The caller sends the order after the block. If the block or its end raises, the caller must not send it, and
+        aerokit orders a hold instead, because an earlier order may still move the vehicle (see `hold_in_background`).
 
-        If the block or its end raises, the caller must not send the order. aerokit then orders a hold, because an
-        earlier order may still move the vehicle (see `hold_in_background`).
+        Raises:
+            BusyError: another stream is open. No order was created.
+            OperationRejected: the order has ended during the block.
+            HeartbeatTimeout: the vehicle is silent at the end of the block.
         """
         self.check_no_stream()
         order = self._arbiter.order(mode)
@@ -273,7 +275,7 @@ ARM_WATCH_S = 15.0
 """Seconds for which aerokit monitors the vehicle after an abandoned arm order, and disarms it if the order arms it."""
 
 ARM_ACK_WAIT_S = 3.0
-"""The COMMAND_ACK of an arm order may arrive this many seconds after the HEARTBEAT that reports armed."""
+"""The COMMAND_ACK of an arm order may arrive up to this many seconds after the HEARTBEAT that reports armed."""
 
 # Seconds to wait for the outcome of an abandoned arm order at the end of the vehicle's `async with` block.
 ARM_CLOSE_TIMEOUT_S = 1.5
@@ -363,7 +365,7 @@ class ArmCleanup:
     async def _was_armed_by(self, order: Order, mode: Mode | None) -> bool:
         """Return True if this order, and no other party, has armed the vehicle.
 
-        ``mode`` is the mode at the time at which the order was abandoned.
+        ``mode`` is the mode that the vehicle reported when the order was abandoned.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)

@@ -94,7 +94,7 @@ class PathFlight:
         # Phase of the set-point, and phase at the end of the path.
         self._phase = path.first_phase
         self._last_phase = path.first_phase + 2 * math.pi * rounds
-        # Distance of the set-point from the start, until it is on the path.
+        # How far the set-point has moved on the straight line to the path.
         self._flown_m = 0.0
         self._present_speed_m_s = 0.0
         self.is_on_path: bool = False
@@ -136,8 +136,8 @@ class PathFlight:
             self._present_speed_m_s = 0.0
         place, tangent, second_derivative = self._path.at(self._phase)
         phase_rate = self._present_speed_m_s / math.hypot(*tangent)
-        # The acceleration must not change the speed. The part of the second derivative that is parallel to the path
-        # would do so, and is subtracted.
+        # The acceleration must not change the speed, so the part of the second derivative that is parallel to the path
+        # is subtracted.
         tangent_north, tangent_east = tangent
         curve_north, curve_east = second_derivative
         tangent_squared = tangent_north**2 + tangent_east**2

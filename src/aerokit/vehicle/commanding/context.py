@@ -59,7 +59,7 @@ class VehicleContext:
         Called at the end of the vehicle's `async with` block. Returns True if it has ordered a hold, or if an earlier
         hold was not confirmed yet.
         """
-        # The newest first, as nested blocks end: a gimbal is stopped before its control is released.
+        # The newest callback runs first, as with nested blocks: a gimbal is stopped before its control is released.
         for callback in tuple(reversed(self.finish_callbacks)):
             try:
                 callback()
@@ -93,7 +93,7 @@ class VehicleContext:
 
 
 class VehicleBase(States):
-    """Base class of the parts of :class:`aerokit.Vehicle`. The parts share the context and do not call each other."""
+    """Base class of the mix-ins of :class:`aerokit.Vehicle`, which share the context and do not call each other."""
 
     def __init__(self, context: VehicleContext) -> None:
         session = context.session

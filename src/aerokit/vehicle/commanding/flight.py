@@ -72,8 +72,8 @@ class FlightActions(VehicleBase):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, or it disarmed or
-                hit the ground, during the take-off.
+            OperationRejected: the vehicle is not armed, or is already flying (nothing was sent). Or during the
+                take-off, its mode changed, or it disarmed or hit the ground.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -113,7 +113,7 @@ class FlightActions(VehicleBase):
             raise explained from error
 
     def _with_landed_state(self, error: CommandRejected) -> CommandRejected | None:
-        """Add the landed state to the error of a refused take-off.
+        """Return the error of a refused take-off with the landed state added to it.
 
         Returns None if the vehicle is not known to be in the air.
         """
@@ -213,8 +213,8 @@ class FlightActions(VehicleBase):
     async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Land at the present position. Returns when the vehicle is on the ground.
 
-        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation the
-        vehicle continues to land.
+        The motors may still be turning then; ``vehicle.armed`` reports when they have stopped. After a cancellation,
+        the vehicle continues to land.
 
         Args:
             timeout: seconds until the vehicle is on the ground; None: no limit.
@@ -260,7 +260,7 @@ class FlightActions(VehicleBase):
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
         except OperationRejected:
             # After a landing, PX4 disarms and changes to LOITER, which ends the order. The vehicle is then on the
-            # ground, as ordered. A refusal does not end the order.
+            # ground, as ordered. If the vehicle has refused the mode, the order has not ended, and the error is raised.
             is_down = self.telemetry.is_confirmed_disarmed or is_reported_on_ground(self.telemetry)
             if not (order.end and is_down and order.is_newest):
                 raise
@@ -273,15 +273,6 @@ class FlightActions(VehicleBase):
         landing_failure = self._sender.landing_failure(order)
         ground = GroundCheck(self._session)
 
-        def is_down() -> bool:
-            # Messages from before the order may be outdated.
-            is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
-            is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
-            # A submarine "lands" by going to the surface. Most submarines have no global position, so an unknown depth
-            # is sufficient.
-            has_surfaced = has_left_surfacing_mode() and not is_deep()
-            return ground.confirms(is_disarmed or is_landed or has_surfaced)
-
         def has_left_surfacing_mode() -> bool:
             return self.telemetry.mode_name == self.autopilot.mode_when_landed and mode.updated_at > accepted_at
 
@@ -290,6 +281,15 @@ class FlightActions(VehicleBase):
                 self._position.was_received_since(order.given_at)
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
+
+        def is_down() -> bool:
+            # Messages from before the order may be outdated.
+            is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
+            is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
+            # A submarine "lands" by going to the surface. Most submarines do not report a global position. Without a
+            # position, the mode change alone counts.
+            has_surfaced = has_left_surfacing_mode() and not is_deep()
+            return ground.confirms(is_disarmed or is_landed or has_surfaced)
 
         def failure_reason() -> str | None:
             if has_left_surfacing_mode() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
@@ -401,7 +401,7 @@ class ModeActions(VehicleBase):
             return ""
         if not order.has_lost_mode:  # Without a mode change, only a failsafe is a takeover.
             return order.failsafe
-        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # also if it is unknown
+        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # or unknown
         awaits_heartbeat = self.telemetry.armed.updated_at < order.mode_lost_at
         if may_have_landed and awaits_heartbeat:
             # PX4 leaves LAND when it disarms. CURRENT_MODE may report the new mode before HEARTBEAT reports that the

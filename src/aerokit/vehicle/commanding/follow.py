@@ -100,7 +100,7 @@ class FollowedTarget:
         speeds = ZERO
         if velocity is not None and telemetry.velocity.age <= POSITION_MAX_AGE_S:
             speeds = (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
-        # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
+        # The altitude above the target's home is left out, because the follower's home may be higher or lower.
         place = position.latest.replace(altitude_relative_m=None)
         self.latest = TargetState(place, speeds, reported_at=received_at, first_reported_at=received_at)
 
@@ -141,9 +141,9 @@ class FollowStream(SteeringStream[TargetState]):
     OFFBOARD on PX4. Leaving the block, also by an exception, orders the vehicle to hold. After a newer order, or a
     takeover by a pilot or a failsafe, the stream sends nothing more, not even the hold.
 
-    The stream stops by itself for the same reasons as a :class:`SetpointStream`, but not because the vehicle does not
-    move. It also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends or
-    raises, or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or
+    The stream stops by itself for the same reasons as a :class:`SetpointStream`, except that the vehicle may stay in
+    place. It also stops if no new position of the target arrives for ``valid_for_s``, if the source of positions ends
+    or raises, or if the target is farther away than ``max_distance_m``. A stop orders the vehicle to hold. ``fly``, or
     else the end of the block, raises :class:`SetpointStreamStopped`.
 
     Entering raises:
@@ -151,7 +151,8 @@ class FollowStream(SteeringStream[TargetState]):
         OperationTimeout: no position of the target was known within ``valid_for_s``.
         InvalidArgument: ``height_m`` was given, but the target has no altitude.
 
-    After these errors, a flying vehicle is ordered to hold if it was still executing an earlier order of the program.
+    After these errors, aerokit orders a flying vehicle to hold if it was still executing an earlier order of the
+    program.
     """
 
     _NAME, _VALUE = "following", "position of the target"

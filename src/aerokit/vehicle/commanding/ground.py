@@ -22,7 +22,7 @@ A vehicle whose motors stop while it climbs is slower than SETTLED_M_S for 0.4 s
 """
 
 STANDING_S, STANDING_M = 5.0, 2.0
-"""A vehicle whose height changes by less than STANDING_M metres in STANDING_S seconds is on the ground.
+"""A vehicle reported on the ground is there if its height changes by at most STANDING_M metres in STANDING_S seconds.
 
 This applies whatever velocity the vehicle reports, because the velocity may be wrong.
 """
@@ -89,7 +89,7 @@ class ImpactDetector:
         velocity, updated_at = cell.latest, cell.updated_at
         if velocity is None or updated_at == self._updated_at:
             return
-        if updated_at < self._updated_at:  # The computer slept; this makes all values older.
+        if updated_at < self._updated_at:  # The computer slept, and aerokit has moved the times of all values back.
             self._updated_at, self._sank_fast_at = updated_at, -math.inf
             return
         # An impact may be shorter than the interval between two velocities, so consecutive velocities are compared even
@@ -97,29 +97,34 @@ class ImpactDetector:
         interval_s = min(updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = updated_at
-        altitude_m = self.current_altitude()
-        sinks_fast = velocity.down_m_s >= IMPACT_M_S
         has_just_sunk_fast = updated_at - self._sank_fast_at <= max_stop_s
-        has_stopped_suddenly = has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S
-        if sinks_fast:
-            max_sink_before_m_s = self._max_sink_m_s if has_just_sunk_fast else 0.0
-            self._max_sink_m_s = max(max_sink_before_m_s, velocity.down_m_s)
-            self._sank_fast_at = updated_at
-        elif has_stopped_suddenly:
-            # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
-            if self._top_m is None or altitude_m is None or self._top_m - altitude_m >= MIN_DROP_M:
-                self._impact_m_s = self._max_sink_m_s
-                # Even an old height is needed, so that a later height can show that the vehicle flies on.
-                self._impact_altitude_m = altitude_amsl(self._telemetry)
+        if velocity.down_m_s >= IMPACT_M_S:
+            self._on_fast_descent(velocity.down_m_s, is_continued=has_just_sunk_fast)
+        elif has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S:
+            self._on_sudden_stop()
         elif _has_changed(self._impact_altitude_m, altitude_amsl(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.
             self._impact_m_s = None
             self._impact_altitude_m = None
-        # While the vehicle does not sink, this is the height before the next descent.
+        # While the vehicle does not sink, its altitude is the one before the next descent.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
-            self._top_m = altitude_m
+            self._top_m = self.current_altitude()
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
         self._has_slowed = self._impact_m_s is not None and (self._has_slowed or is_slow)
+
+    def _on_fast_descent(self, sink_m_s: float, *, is_continued: bool) -> None:
+        max_sink_before_m_s = self._max_sink_m_s if is_continued else 0.0
+        self._max_sink_m_s = max(max_sink_before_m_s, sink_m_s)
+        self._sank_fast_at = self._updated_at
+
+    def _on_sudden_stop(self) -> None:
+        altitude_m = self.current_altitude()
+        drop_m = None if self._top_m is None or altitude_m is None else self._top_m - altitude_m
+        # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
+        if drop_m is None or drop_m >= MIN_DROP_M:
+            self._impact_m_s = self._max_sink_m_s
+            # Even an old altitude is needed, so that a later altitude can show that the vehicle flies on.
+            self._impact_altitude_m = altitude_amsl(self._telemetry)
 
     def describe(self) -> str:
         """Return a text about the impact; empty if there was none."""
@@ -143,7 +148,7 @@ class GroundCheck:
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
         self._impact = ImpactDetector(session.telemetry)
-        # Time and height of the report that the vehicle is on the ground.
+        # Time of the report that the vehicle is on the ground, and altitude above sea level at that time.
         self._reported_at: float | None = None
         self._reported_altitude_m: float | None = None
         # Time since which the vehicle moves up or down slower than SETTLED_M_S; infinite while it moves faster.
@@ -164,7 +169,7 @@ class GroundCheck:
 
     def confirms(self, is_reported: bool) -> bool:
         """Return True if the vehicle is reported on the ground, has settled since, and did not fall."""
-        now, velocity = self._session.connection.now(), self._session.telemetry.velocity
+        now = self._session.connection.now()
         self._impact.update()
         if not is_reported:
             self._reported_at = None
@@ -173,7 +178,7 @@ class GroundCheck:
             self._reported_at = now
             self._settled_since = math.inf
             self._reported_altitude_m = self._impact.current_altitude()
-        return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
+        return self._has_settled(now) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
         return self.fall() if self.is_reported_on_ground else in_flight()
@@ -186,13 +191,11 @@ class GroundCheck:
             return f"the vehicle was disarmed in the air and sinks at {self._down_m_s():.1f} m/s"
         return self._impact.describe() or None
 
-    def _has_settled(self, now: float, updated_at: float) -> bool:
-        """Return True if the vehicle has stopped climbing or sinking.
-
-        ``updated_at`` is the time of the last velocity.
-        """
+    def _has_settled(self, now: float) -> bool:
+        """Return True if the vehicle has stopped climbing or sinking."""
+        velocity_at = self._session.telemetry.velocity.updated_at
         reported_at = now if self._reported_at is None else self._reported_at
-        if now - updated_at > VELOCITY_MAX_AGE_S:
+        if now - velocity_at > VELOCITY_MAX_AGE_S:
             # Without a recent velocity, the report that the vehicle is on the ground is sufficient.
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
@@ -203,8 +206,8 @@ class GroundCheck:
             is_known = altitude_m is not None and self._reported_altitude_m is not None
             is_still = is_known and not _has_changed(self._reported_altitude_m, altitude_m, STANDING_M)
             return is_still and now - reported_at >= STANDING_S
-        self._settled_since = min(self._settled_since, max(updated_at, reported_at))
-        return updated_at >= self._settled_since + SETTLING_S
+        self._settled_since = min(self._settled_since, max(velocity_at, reported_at))
+        return velocity_at >= self._settled_since + SETTLING_S
 
     def _down_m_s(self) -> float:
         velocity = self._session.telemetry.velocity.latest

@@ -41,8 +41,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# For autopilots that restart their path at each position set-point: a new one is sent INITIAL_REPEATS times at the
-# stream's rate, because one may be lost, and then only every REPEAT_INTERVAL_S seconds.
+# Some autopilots restart their path at each position set-point. They get a new set-point INITIAL_REPEATS times at the
+# stream's rate, because a message may be lost, and after that only every REPEAT_INTERVAL_S seconds.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
 # Set-points that the autopilot executes with its own limits of acceleration. With these, a sudden stop is an impact.
@@ -90,8 +90,8 @@ class Guided:
     ) -> SetpointStream[BodyVelocitySetpoint]:
         """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
 
-        With ``yaw_deg`` on ArduPilot, "forward" is the direction of the vehicle's nose at the time of ``set``, and
-        stays so while the vehicle turns. Therefore call ``set`` often during a turn.
+        With ``yaw_deg`` on ArduPilot, the velocity does not turn with the vehicle: "forward" stays the direction of the
+        vehicle's nose at the time of ``set``. Therefore call ``set`` often during a turn.
         """
         return self._stream("velocity", self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
 
@@ -150,7 +150,7 @@ class Guided:
         """Stream body rates with thrust to ArduCopter or PX4 (SET_ATTITUDE_TARGET without an attitude).
 
         Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`. The
-        autopilot does not level the vehicle: it keeps turning at these rates until the next set-point. Without a new
+        autopilot does not level the vehicle, which keeps turning at these rates until the next set-point. Without a new
         set-point for ``valid_for_s``, aerokit orders a hold.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
@@ -235,7 +235,7 @@ class SetpointStream(SteeringStream[SetpointT]):
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
-        # For autopilots that restart their path at each position set-point: how many more times it is sent at the
+        # If the autopilot restarts its path at each set-point: how many more times the present set-point is sent at the
         # stream's rate, and when it was last sent.
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf

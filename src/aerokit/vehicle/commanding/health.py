@@ -27,12 +27,12 @@ PREARM_REPORT_DURATION_S = 3.0
 CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 """The reason for a refusal to arm if no other reason is known."""
 REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
-"""Beginnings of reasons about missing or old reports, without which it is unknown whether the vehicle can arm."""
+"""Beginnings of the reasons about missing or old reports that show whether the vehicle can arm."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
-def in_order(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
-    """Join the reasons in the order of an error text. ``report_reasons`` are those about missing or old reports."""
+def join_reasons(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
+    """Join the reasons about missing or old reports with the others. Reports that decide about arming come first."""
     first = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
     last = [reason for reason in report_reasons if reason not in first]
     return [*first, *other_reasons, *last]
@@ -53,7 +53,7 @@ class Health:
         self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly. Sends nothing."""
+        """Return what the vehicle still needs for a flight. Sends nothing."""
         telemetry = self._telemetry
         missing = [
             f"{cell.name} ({cell.waits_for} not received)"
@@ -63,7 +63,7 @@ class Health:
         texts = self._recent_texts()
         is_explained = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
         unexplained = self._unnamed_reasons() if self._checks_fail() and not is_explained else []
-        return in_order([*missing, *self._outdated_states()], [*texts, *self._health_problems(), *unexplained])
+        return join_reasons([*missing, *self._outdated_states()], [*texts, *self._health_problems(), *unexplained])
 
     def _recent_texts(self) -> list[str]:
         """Return why pre-arm checks fail, from recent status texts."""
@@ -108,9 +108,9 @@ class Health:
         return list(await self.arming_reasons(self._session.connection.now()))
 
     async def arming_reasons(self, since: float) -> tuple[str, ...]:
-        """Return the reasons against arming, among them the status texts received since ``since``.
+        """Return the reasons against arming, among them the status texts received since the time ``since``.
 
-        Without such texts, the vehicle is requested to run its pre-arm checks.
+        If there are no such texts, aerokit requests the vehicle to run its pre-arm checks.
         """
         with self._session.streaming("sensors", "estimator"):
             await self._session.wait_for_status_texts()
@@ -118,7 +118,7 @@ class Health:
             await self._refresh()
         problems = self._health_problems() if self._needs_position() else self._failing_sensors()
         other_reasons = [*self.arming_texts(since), *self.unarmable_mode(), *problems]
-        reasons = self._session.deduplicate_reasons(*in_order(self._outdated_states(), other_reasons))
+        reasons = self._session.deduplicate_reasons(*join_reasons(self._outdated_states(), other_reasons))
         if not reasons and self._checks_fail():
             return tuple(self._unnamed_reasons())
         return reasons
@@ -165,13 +165,13 @@ class Health:
             await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= HEALTH_MAX_AGE_S)
 
     async def request_reasons(self, since: float) -> None:
-        """If pre-arm checks fail, request the status texts about them, unless some arrived since ``since``."""
+        """Request the status texts about failing pre-arm checks, unless some have arrived since the time ``since``."""
         sensors = self._telemetry.sensors.latest
         if sensors is not None and sensors.prearm_checks_pass is False and not self._telemetry.is_armed:
             await self._request_texts(since)
 
     async def _request_texts(self, since: float) -> None:
-        """Let the vehicle run its pre-arm checks. Does nothing if texts about arming were received since ``since``."""
+        """Let the vehicle run its pre-arm checks, unless it has sent texts about arming since the time ``since``."""
         if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
             return
         requested_at = self._session.connection.now()

@@ -53,13 +53,13 @@ class ManeuverActions(VehicleBase):
     ) -> None:
         """Fly circles around a place.
 
-        Returns when the vehicle's reported positions have gone around the place ``turns`` times.
-        Afterwards a multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit
-        orders the vehicle to hold.
+        Returns when the vehicle's reported positions have gone around the place ``turns`` times. Afterwards a
+        multicopter holds, and a fixed wing goes on circling. After a cancellation or a time-out, aerokit orders the
+        vehicle to hold.
 
         PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
-        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. aerokit therefore
-        streams set-points in GUIDED, and the vehicle stops if your program dies.
+        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. For ArduCopter, aerokit
+        therefore streams set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
@@ -82,7 +82,7 @@ class ManeuverActions(VehicleBase):
         Other errors are those of :meth:`go_to`.
         """
         from aerokit.vehicle.commanding.closed_paths import Circle, TurnCounter
-        from aerokit.vehicle.commanding.rounds import RoundFlight
+        from aerokit.vehicle.commanding.rounds import FlightLimits, RoundFlight
 
         check_range("radius_m", radius_m, 0, MAX_RADIUS_M, above=True)
         check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
@@ -90,7 +90,7 @@ class ManeuverActions(VehicleBase):
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
         place = travel_target(center)
         counter = TurnCounter(radius_m, clockwise=clockwise)
-        limits = (max_distance_m, timeout, max_silence_s)
+        limits = FlightLimits(max_distance_m, timeout, max_silence_s)
         if self.autopilot.circles_by == "setpoints":
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
             path = Circle(radius_m, clockwise=clockwise, first_phase=flight.bearing_rad)
@@ -137,7 +137,7 @@ class ManeuverActions(VehicleBase):
                 A flight by set-points ends after 3.5 s without a heartbeat in any case.
         """
         from aerokit.vehicle.commanding.closed_paths import Eight, LobeCounter
-        from aerokit.vehicle.commanding.rounds import RoundFlight
+        from aerokit.vehicle.commanding.rounds import FlightLimits, RoundFlight
 
         check_range("major_radius_m", major_radius_m, 0, MAX_RADIUS_M, above=True)
         check_range("minor_radius_m", minor_radius_m, 0, major_radius_m / 2, above=True)
@@ -151,7 +151,7 @@ class ManeuverActions(VehicleBase):
         if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
         counter = LobeCounter(major_radius_m, axis_deg)
-        limits = (max_distance_m, timeout, max_silence_s)
+        limits = FlightLimits(max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "figure_eight", travel_target(center), counter, rounds, limits)
         if is_flown_by_px4:
             major_m = major_radius_m if clockwise else -major_radius_m
@@ -177,9 +177,9 @@ class ManeuverActions(VehicleBase):
     ) -> None:
         """Go to a place and stay there: a fixed wing circles, a multicopter hovers.
 
-        Returns when the vehicle has arrived and has then flown ``turns`` turns or waited ``duration_s`` seconds, if one
-        of these is given. The vehicle stays until another order. After a cancellation or a time-out, aerokit orders the
-        vehicle to hold where it is.
+        Returns when the vehicle has arrived, has then flown ``turns`` turns, and has then stayed for ``duration_s``
+        seconds; both are optional. The vehicle stays until another order. After a cancellation or a time-out, aerokit
+        orders the vehicle to hold where it is.
 
         Sends MAV_CMD_DO_REPOSITION (ArduPilot in GUIDED, PX4 in LOITER). For a PX4 fixed wing with ``radius_m``, sends
         MAV_CMD_DO_ORBIT.
@@ -190,7 +190,7 @@ class ManeuverActions(VehicleBase):
                 (WP_LOITER_RAD, NAV_LOITER_RAD).
             clockwise: direction of the circle, as seen from above; only with ``radius_m``.
             turns: return after this many turns, above 0, at most 1000; only with ``radius_m``.
-            duration_s: return this many seconds after the arrival.
+            duration_s: return this many seconds after the arrival, or after the last turn.
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds in total. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle
                 moves.
@@ -203,7 +203,7 @@ class ManeuverActions(VehicleBase):
         Other errors are those of :meth:`go_to`.
         """
         from aerokit.vehicle.commanding.closed_paths import TurnCounter
-        from aerokit.vehicle.commanding.rounds import RoundFlight
+        from aerokit.vehicle.commanding.rounds import FlightLimits, RoundFlight
 
         if turns is not None:
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
@@ -225,7 +225,7 @@ class ManeuverActions(VehicleBase):
         else:
             counter = TurnCounter(radius_m, clockwise=clockwise)
             command, params, mode = self._circle_command("loiter", radius_m, math.nan, "free", clockwise=clockwise)
-        limits = (max_distance_m, timeout, max_silence_s)
+        limits = FlightLimits(max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits, center_name="target")
         await flight.fly_by_command(
             command, params, mode, holds_at_end=False, stay_s=duration_s or 0.0, radius_m=radius_m or 0.0

@@ -96,12 +96,12 @@ async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: 
         monitor.reset()
         with anyio.move_on_after(retry_interval_s):
             await monitor.must_request.wait()
-            retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
-            continue  # An event has occurred, so the streams are requested again at once.
-        retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
         if monitor.has_received:  # The vehicle streams, so only an event requires a new request.
             await monitor.must_request.wait()
+        if monitor.must_request.is_set():
             retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
+        else:
+            retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
 
 
 async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: ExitStack) -> None:
@@ -173,9 +173,8 @@ class MessagingActions(VehicleBase):
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time.
                 None: 3 for a request for data, 0 for all other commands, because a retry after a lost ack would execute
-                the command twice. If you allow retries for such a command, it is sent again only right after a
-                HEARTBEAT, and only if the mode has not changed, no failsafe is active and there is no newer order
-                (docs/reliability.md).
+                the command twice. aerokit retries a command other than a request only right after a HEARTBEAT, and only
+                if the mode has not changed, no failsafe is active and there is no newer order (docs/reliability.md).
             attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
                 trips if necessary. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
@@ -262,41 +261,46 @@ class MessagingActions(VehicleBase):
         """
         target = getattr(message, "target_system", self.system_id)  # All steering messages have this field.
         subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
+        if not subjects:
+            return
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
             self._arbiter.record_own_arming(message.param1 == 1)
-        elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
-            names = self.telemetry.mode_names
-            modes: tuple[Mode, ...] = ()  # An empty tuple means that any mode may be the effect.
-            if isinstance(message, (CommandInt, CommandLong)):
-                params = (message.param1, message.param2, message.param3, message.param4)
-                modes = self.autopilot.modes_of_command(message.command, params, names)
-            elif message.base_mode & CUSTOM_MODE_ENABLED:
-                modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
-            self._arbiter.raw_order(subjects, modes=modes).was_sent = True
-        elif subjects:  # Set-points and mission messages end posted orders, but not the action in progress.
+        elif isinstance(message, (CommandInt, CommandLong, SetMode)):
+            order = self._arbiter.raw_order(subjects, modes=self._modes_of(message))
+            order.was_sent = True
+        else:  # Set-points and mission messages end posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
+
+    def _modes_of(self, message: CommandInt | CommandLong | SetMode) -> tuple[Mode, ...]:
+        """Return the modes to which the message may change; an empty tuple if that may be any mode."""
+        names = self.telemetry.mode_names
+        if isinstance(message, SetMode):
+            has_custom_mode = message.base_mode & CUSTOM_MODE_ENABLED
+            return (self.autopilot.mode(message.custom_mode, message.base_mode, names),) if has_custom_mode else ()
+        params = (message.param1, message.param2, message.param3, message.param4)
+        return self.autopilot.modes_of_command(message.command, params, names)
 
     @contextmanager
     def posted(
         self, *subjects: Subject, modes: tuple[Mode, ...] = (), armed: bool | None = None
     ) -> Iterator[PostedOrder]:
-        """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
+        """Open an order without waiting for its effect, so that orders for mode, arming and take-off can overlap.
 
-        In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
-        or their effect is reported. The retries also end in these cases:
+        In the ``with`` block, aerokit sends each command of the order again right after a HEARTBEAT, until the vehicle
+        acknowledges it or reports its effect. The retries also end in these cases:
 
-        - A newer order is given whose subjects include the first subject of this order.
-        - The mode changes, and neither this order nor any order of the ten seconds before it asked for the new mode. An
-          order to disarm is still retried.
-        - A failsafe becomes active. An order to land, to return or to disarm is still retried.
+        - You give a newer order about the first of ``subjects``.
         - The vehicle reboots or, if the first subject is ``"motion"``, disarms.
+        - A failsafe becomes active. This does not end an order to land, to return or to disarm.
+        - The mode changes to one that neither this order nor an order of the ten seconds before it asked for. This does
+          not end an order to disarm.
 
         If you leave the block early, aerokit neither makes the vehicle hold nor disarms it if it arms later. Use the
         actions for that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first one is mode or motion, the order also ends the
-                action in progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first subject is mode or motion, the order also ends
+                the action in progress.
             modes: the modes that the vehicle may change to because of the order.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
@@ -349,7 +353,7 @@ class MessagingActions(VehicleBase):
     def streams(self, rate_hz: float) -> Iterator[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        Use it for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
+        Use this for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
         gets REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no
         message arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit
         requests only those common states that are missing.
@@ -421,5 +425,5 @@ class MessagingActions(VehicleBase):
         return self._context.describe_now()
 
     def texts_since(self, at: float) -> tuple[str, ...]:
-        """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
+        """Return the status texts (STATUSTEXT) received since ``at``, a time of the loop's clock, oldest first."""
         return self._session.texts_since(at)

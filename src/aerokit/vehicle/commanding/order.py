@@ -54,7 +54,7 @@ CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.DO_PAUSE_CONTINUE: MOTION,
     MavCmd.COMPONENT_ARM_DISARM: ARM_ALONE,
 }
-"""Maps MAV_CMD to what it changes (mode, motion, arming). A raw command supersedes actions that change the same."""
+"""Maps MAV_CMD to what it changes (mode, motion, arming). A raw command supersedes orders about any of these."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_MODE": _MODE,
     "SET_ATTITUDE_TARGET": MOTION,
@@ -159,7 +159,7 @@ class Order:
         self.armed = armed
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
         self.may_move: bool = False
-        """True once the vehicle may move because of this or an earlier order. It must hold if this one is abandoned."""
+        """True once this or an earlier order may move the vehicle, which must hold if this order is abandoned."""
         self.was_refused: bool = False
         """True if the vehicle refused the order, and therefore continues its previous task."""
         self.was_flown_before: bool = False
@@ -183,7 +183,7 @@ class Order:
         CURRENT_MODE may report the mode before the HEARTBEAT that reports the mode and, after a landing, disarming.
         """
         self.arm_command: int | None = None
-        """Number of the order's arm or disarm command among those of the program; None until it was sent."""
+        """Sequence number of the order's arm or disarm command; None until the command was sent."""
         self.was_sent: bool = False
         """True once the first transmission of the order's first command began."""
         self.only_stops: bool = False
@@ -262,30 +262,35 @@ class Order:
         if is_change and (is_own_effect or is_expected):  # An effect of this or of an earlier order.
             self.may_move = True
         if number in self._own_modes:
-            self.is_confirmed = self.is_confirmed or is_change
-            has_taken_effect = is_change or not self._requires_mode_change
-            if has_taken_effect and is_settled:
-                self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.
-            elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
-                self._accepted_modes -= self._modes_before
+            self._on_own_mode(is_change=is_change, is_settled=is_settled)
         elif is_expected and is_settled:
-            # An earlier order of the program has changed the mode. If `mode_before` returns, another party has set it.
+            # An earlier order of the program has changed the mode. After this, only another party can change it back.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:
                 self.unexplained = f"the mode changed to {mode}"
             self._accepted_modes.add(number)
         elif number not in self._accepted_modes and self._ends_on_mode_change:
-            # The pilot or a failsafe has changed the mode.
-            if not self.has_lost_mode:
-                self.mode_lost_at = reported_at
-            self.has_lost_mode = True
-            self.takeover_reason = self.takeover_reason or f"the mode changed to {mode}"
+            self._on_takeover(mode, reported_at)
         self._mode_now = number
 
+    def _on_own_mode(self, *, is_change: bool, is_settled: bool) -> None:
+        self.is_confirmed = self.is_confirmed or is_change
+        has_taken_effect = is_change or not self._requires_mode_change
+        if has_taken_effect and is_settled:
+            self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.
+        elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
+            self._accepted_modes -= self._modes_before
+
+    def _on_takeover(self, mode: Mode, reported_at: float) -> None:
+        if not self.has_lost_mode:
+            self.mode_lost_at = reported_at
+        self.has_lost_mode = True
+        self.takeover_reason = self.takeover_reason or f"the mode changed to {mode}"
+
     def on_system_status(self, state: int) -> None:
-        # A failsafe that was active before the order does not end it. `end` ignores a failsafe if the order ends the
-        # flight.
+        # A failsafe that was active before the order does not end the order. With `ends_flight`, `end` ignores all
+        # failsafes.
         if is_worse_failsafe(state, self._last_state):
             self.failsafe = self.failsafe or failsafe_text(state)
         self._last_state = state
@@ -307,7 +312,7 @@ class SentCommand:
 
     The command may be sent again while the vehicle has reported neither the command's effect nor an action of another
     party. The effect is a change to one of ``modes`` or to ``armed``; ``is_done`` reports any other effect. ``slept_s``
-    returns for how many seconds the computer was suspended since the first transmission.
+    returns how many seconds the computer has slept since the first transmission.
     """
 
     def __init__(

@@ -59,8 +59,8 @@ class PostedOrder:
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG of this order. Returns at the acknowledgement, or when the order's effect is reported.
 
-        The command is not sent again after a newer order about the same subject, or after another party changed the
-        mode.
+        After a newer order about the same subject, or after another party changed the mode, aerokit does not send the
+        command again.
 
         Args:
             command: the MAV_CMD.
@@ -125,14 +125,14 @@ class PostedOrder:
                 may_retry = error.result == MavResult.TEMPORARILY_REJECTED and attempts_left and not self.end
                 if may_retry and await self._is_valid_at_next_heartbeat(timeout):
                     continue
-                # Ignore the refusal if HEARTBEAT has reported an effect of the order, and reports this mode. The order
-                # may have other modes, too.
+                # Ignore the refusal if HEARTBEAT has reported an effect of the order. It must also report this mode,
+                # because the order may have several modes.
                 if not (self._order.is_confirmed and self._session.telemetry.is_in(mode)):
                     raise
             return
 
     async def _is_valid_at_next_heartbeat(self, timeout: float) -> bool:
-        """Return False if the order has ended by then, or if no HEARTBEAT arrives in time."""
+        """Wait for the next HEARTBEAT. Return False if the order has ended, or if no HEARTBEAT arrives in time."""
         started_at, armed = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(MODE_RETRY_INTERVAL_S)
         with (

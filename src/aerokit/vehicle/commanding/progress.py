@@ -43,7 +43,7 @@ HIT_GROUND = "the vehicle hit the ground"
 """Beginning of each clause about an impact."""
 
 FALL_STOP_S = 1.5
-"""A vehicle on the ground has fallen if it stood still at most this many seconds after a fast descent."""
+"""A vehicle on the ground has fallen if it came to rest at most this many seconds after a fast descent."""
 
 
 async def await_progress(
@@ -145,8 +145,8 @@ class ChangeSignal:
 class StallDetector:
     """Detects that a vehicle does not move although it has accepted an order to move.
 
-    The detector reports nothing without positions. It waits for ``STALL_TIMEOUT_S`` seconds, because a vehicle may
-    first turn or spool up.
+    ``STALL_TIMEOUT_S`` leaves the vehicle time to turn or to spool up first. Without recent positions, the detector
+    reports nothing.
     """
 
     def __init__(self, session: VehicleSession) -> None:
@@ -243,7 +243,8 @@ class VehiclePosition:
     def distance_to(self, target: Position) -> float:
         """Return the distance to ``target`` in metres; infinite while the position is unknown.
 
-        It is three-dimensional if both have an altitude of the same kind, otherwise along the ground.
+        The distance is three-dimensional if the vehicle's position and the target have an altitude of the same kind.
+        Otherwise it is measured along the ground.
         """
         here = self._telemetry.position.latest
         if here is None:
@@ -258,8 +259,8 @@ class VehiclePosition:
     ) -> None:
         """Raise InvalidArgument for a place farther away than ``max_distance_m``.
 
-        While the vehicle's position is unknown, all places are accepted. With ``are_items``, the error text has the
-        index of the place, and None stands for an item without a place.
+        While the vehicle's position is unknown, all places are accepted. ``name`` is the caller's argument, for error
+        texts. With ``are_items``, the places are those of mission items, None for an item without a place.
         """
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
@@ -315,14 +316,14 @@ class VehiclePosition:
         return -math.inf if altitude is None else altitude
 
     def home_altitude(self) -> float:
-        """Return the altitude above mean sea level in metres. Raises ValueUnknownError if it is unknown."""
+        """Return home's altitude above mean sea level in metres. Raises ValueUnknownError if it is unknown."""
         return self._telemetry.home.value.altitude_amsl_m
 
     def global_target(self, target: Position, name: str = "target") -> tuple[int, int, float, MavFrame]:
-        """Return latitude and longitude in 1e-7 degrees, the altitude in metres, and the frame of the altitude.
+        """Convert a target to latitude and longitude in 1e-7 degrees, altitude in metres, and frame of the altitude.
 
-        If the target has both altitudes, the relative one counts. If it has none, the vehicle's present altitude is
-        used. ``name`` is the caller's argument, for error texts.
+        If the target has both altitudes, the relative one counts. If it has none, the vehicle's present altitude
+        counts. ``name`` is the caller's argument, for error texts.
         """
         relative_m, amsl_m = target.altitude_relative_m, target.altitude_amsl_m
         if relative_m is None and amsl_m is None:
@@ -343,10 +344,10 @@ class VehiclePosition:
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, frame
 
     def as_ordered(self, target: Position) -> Position:
-        """Return the target with the kind of altitude that the vehicle is ordered to; see :meth:`global_target`.
+        """Return the target with the altitude that aerokit sends; see :meth:`global_target`.
 
-        PX4 corrects the altitude of home in the first two minutes of a flight (HomePosition.cpp). The altitude above
-        mean sea level that it was ordered to stays.
+        PX4 gets an altitude above mean sea level. It keeps this altitude when it later corrects the altitude of home,
+        as it does in the first two minutes of a flight (HomePosition.cpp).
         """
         if target.altitude_relative_m is None or self.accepts_relative_altitude:
             return target
@@ -354,7 +355,7 @@ class VehiclePosition:
         return target.replace(altitude_relative_m=None, altitude_amsl_m=altitude_m)
 
     def command_place(self, target: Position, name: str = "target") -> dict[str, Any]:
-        """Return the place as arguments of a COMMAND_INT; see :meth:`global_target`."""
+        """Return the target as arguments of a COMMAND_INT; see :meth:`global_target`."""
         latitude, longitude, altitude, frame = self.global_target(target, name)
         return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 

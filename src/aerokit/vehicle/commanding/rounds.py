@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import anyio
 
@@ -39,12 +39,19 @@ FRAME_TIMEOUT_S = 5.0
 """Seconds to wait for a new position in each frame, because set-points are in the local frame."""
 
 
-class RoundFlight:
-    """One flight to a place and, with a ``counter`` of rounds, around it.
+class FlightLimits(NamedTuple):
+    """Limits of a flight; see :meth:`aerokit.Vehicle.orbit`."""
 
-    The flight ends after the given ``rounds``; None: it lasts until cancelled. ``limits`` are max_distance_m, timeout
-    and max_silence_s. ``center_name`` is the name of the place for error texts. The constructor checks the place, and
-    that the vehicle is flying.
+    max_distance_m: float
+    timeout: float | None
+    max_silence_s: float | None
+
+
+class RoundFlight:
+    """One flight to a place, and around it if there is a ``counter`` of rounds.
+
+    The flight ends after ``rounds`` rounds; None: when it is cancelled. ``center_name`` is the name of the place for
+    error texts. The constructor checks the place, and that the vehicle is flying.
     """
 
     def __init__(
@@ -54,7 +61,7 @@ class RoundFlight:
         center: Position,
         counter: TurnCounter | LobeCounter | None,
         rounds: float | None,
-        limits: tuple[float, float | None, float | None],
+        limits: FlightLimits,
         *,
         center_name: str = "center",
     ) -> None:
@@ -64,15 +71,14 @@ class RoundFlight:
         self._operation = operation
         self._counter = counter
         self._rounds = math.inf if rounds is None else rounds
-        max_distance_m, self._timeout, self._max_silence_s = limits
-        # Reason why the vehicle does not fly the ordered circle; empty if it does. If there is a reason, the vehicle is
-        # ordered to hold.
+        self._limits = limits
+        # Why the vehicle does not fly the ordered circle, so that `fly_by_command` must order a hold; empty if it does.
         self._circle_problem = ""
         position = context.vehicle_position
         # The center as arguments of a COMMAND_INT.
         self._place = position.command_place(center, center_name)
         self._center = position.as_ordered(center)
-        position.check_reach(center_name, [center], max_distance_m)
+        position.check_reach(center_name, [center], limits.max_distance_m)
         position.check_flying(operation)
 
     @property
@@ -93,10 +99,10 @@ class RoundFlight:
         stay_s: float = 0.0,
         radius_m: float = 0.0,
     ) -> None:
-        """Send the command, and wait until the rounds are flown and another ``stay_s`` seconds have passed.
+        """Send the command. Returns ``stay_s`` seconds after the last round; without rounds, after the arrival.
 
-        With ``holds_at_end``, the vehicle then holds. Otherwise it continues to circle. ``radius_m`` is the ordered
-        radius; 0 if the command has none.
+        With ``holds_at_end``, aerokit then orders a hold. Otherwise the vehicle stays, circling or hovering.
+        ``radius_m`` is the ordered radius; 0 if the command has none.
         """
         context, cleanup = self._context, self._context.flight_cleanup
         hold_mode = context.sender.mode_for(self._operation, "hold")
@@ -122,7 +128,6 @@ class RoundFlight:
             raise
 
     async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, radius_m: float) -> None:
-        """Wait until the rounds are flown and another ``stay_s`` seconds have passed."""
         session, started = self._session, self._session.connection.now()
         detect_stall, mode_failure = StallDetector(session), self._context.sender.mode_failure(order, mode)
         wrong_radius = ""  # error text about the last reported radius; empty if it is the ordered one
@@ -138,17 +143,10 @@ class RoundFlight:
         def failure_reason() -> str | None:
             if reason := mode_failure():
                 return reason
-            texts = session.telemetry.texts_since(order.given_at)
-            refusals = (
-                text.text
-                for text in texts
-                # A later refusal is about something else, e.g. a mission that another ground station uploads.
-                if text.at <= started + CIRCLE_REPORT_S and session.autopilot.is_refusal(text.text)
-            )
+            refusal = self._first_refusal(order.given_at, started + CIRCLE_REPORT_S)
             # For a moment, PX4 may still report the previous circle.
             is_radius_reported = session.connection.now() > started + CIRCLE_REPORT_S
-            # `fly_by_command` orders the vehicle to hold if there is a problem.
-            self._circle_problem = next(refusals, wrong_radius if is_radius_reported else "")
+            self._circle_problem = refusal or (wrong_radius if is_radius_reported else "")
             return self._circle_problem or None
 
         def stall_reason() -> str | None:
@@ -163,13 +161,19 @@ class RoundFlight:
                 is_done=lambda: self._are_rounds_flown(started) and not order.end,
                 failure_reason=failure_reason,
                 describe=self._describe,
-                timeout=self._timeout,
-                max_silence_s=self._max_silence_s,
+                timeout=self._limits.timeout,
+                max_silence_s=self._limits.max_silence_s,
                 held_for=stay_s,
                 stall_reason=stall_reason,
             )
         finally:
             detach()
+
+    def _first_refusal(self, since: float, until: float) -> str:
+        """Return the first status text in this time that refuses the circle; empty if there is none."""
+        # A later refusal is about something else, e.g. a mission that another ground station uploads.
+        texts = [text.text for text in self._telemetry.texts_since(since) if text.at <= until]
+        return next(filter(self._session.autopilot.is_refusal, texts), "")
 
     def _are_rounds_flown(self, started: float) -> bool:
         is_known = self._context.vehicle_position.was_received_since(started)
@@ -206,7 +210,10 @@ class RoundFlight:
     async def fly_by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> None:
         """Stream the set-points of a path. At the end, the vehicle holds."""
         try:
-            with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
+            with (
+                self._session.streaming("position", "local_position"),
+                anyio.move_on_after(self._limits.timeout) as scope,
+            ):
                 mode = self._context.sender.mode_for(self._operation, "setpoint")
                 with self._context.flight_cleanup.preparing_stream(mode) as order:
                     flight = await self._path_flight(path, speed_m_s, facing)
@@ -215,7 +222,7 @@ class RoundFlight:
             error_class = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
             raise error_class(f"{self._operation}: {error}") from error
         if scope.cancelled_caught:
-            raise OperationTimeout(f"{self._operation}: not done within {self._timeout:g} s; {self._describe()}")
+            raise OperationTimeout(f"{self._operation}: not done within {self._limits.timeout:g} s; {self._describe()}")
 
     async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
         position, local_position = self._telemetry.position, self._telemetry.local_position

@@ -59,8 +59,8 @@ class OrderSender:
     ) -> None:
         """Send one command of an order until it is acknowledged or its effect is reported.
 
-        The effect is reported once the vehicle has changed to one of ``modes`` or to ``armed``, or ``is_done()``
-        returns True. From the second command of a steering order on, :meth:`await_recent_state` is called first.
+        The effect is reported when HEARTBEAT changes to one of ``modes`` or to ``armed``, or when ``is_done()`` returns
+        True. Before the second and later commands of a steering order, this call waits for a recent HEARTBEAT.
 
         Raises:
             OperationRejected: the order was superseded or taken over, or the computer slept.
@@ -111,7 +111,7 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for a recent HEARTBEAT before a command. ``order`` is None before the first command of an order.
+        """Wait for a recent HEARTBEAT. Pass ``order`` if one of its commands was already sent.
 
         Raises OperationRejected if the order has ended or the computer slept, and HeartbeatTimeout if there is no
         HEARTBEAT for ``MAX_SILENCE_S``.
@@ -271,10 +271,10 @@ class OrderSender:
         timeout: float,
         max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Wait until HEARTBEAT reports the effect of an accepted command.
+        """Wait until ``is_done()`` reports the effect of an accepted command.
 
-        ``operation`` is the name for error texts. ``refusals`` is the list of ``VehicleSession.refusals_of``. It is
-        needed because PX4 acknowledges some commands twice: first always with ACCEPTED, then perhaps with a refusal.
+        ``operation`` is the name for error texts. ``refusals`` is the list that ``VehicleSession.refusals_of`` fills:
+        PX4 acknowledges some commands twice, first always with ACCEPTED, then perhaps with a refusal.
 
         Raises:
             CommandRejected: the vehicle first accepted and then refused the command.
@@ -317,7 +317,7 @@ class OrderSender:
         return mode
 
     def mode_failure(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """Return a function that returns why the order cannot succeed; None while it may succeed.
+        """Return a function that returns the reason why the order has failed, or None while it may succeed.
 
         Possible reasons are a newer order, an impact on the ground, disarming, and a mode that is not one of
         ``modes``. The vehicle has three seconds to report one of the modes.
@@ -337,12 +337,13 @@ class OrderSender:
             if self._session.connection.now() < settles_at:  # The mode of an abandoned order may still be reported.
                 return None
             mode = self._session.telemetry.mode.latest
-            was_in_mode = was_in_mode or mode in modes
-            if mode not in modes and was_in_mode:
+            if mode in modes:
+                was_in_mode = True
+                return None
+            if was_in_mode:
                 return f"the mode changed to {mode}"
-            if mode not in modes and self._session.connection.now() > grace_until:
-                return f"the vehicle stayed in {mode}"
-            return None
+            has_grace_ended = self._session.connection.now() > grace_until
+            return f"the vehicle stayed in {mode}" if has_grace_ended else None
 
         return failure_reason
 

@@ -108,8 +108,8 @@ class PositionSetpoint(Snapshot):
 class AttitudeSetpoint(Snapshot):
     """Attitude in degrees and ``thrust`` from 0 to 1.
 
-    ArduCopter in GUIDED reads ``thrust`` as climb rate, where 0.5 holds the altitude, unless GUID_OPTIONS selects
-    thrust. PX4 reads it as collective thrust.
+    ArduCopter in GUIDED reads ``thrust`` as climb rate: 0.5 holds the altitude. With bit 3 of GUID_OPTIONS, it reads
+    ``thrust`` as collective thrust, as PX4 always does.
     """
 
     roll_deg: float
@@ -172,8 +172,8 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
     if isinstance(setpoint, PositionSetpoint):
         distance_m = context.vehicle_position.distance_to(setpoint.position)  # infinite if the position is unknown
         return max_resting_m < distance_m < math.inf
-    # Positions are read last and only if they are needed, because reading one decodes it, and set-points are sent at up
-    # to 400 Hz.
+    # Reading `local_position` decodes a message, so it is read only for the set-points that need it: this function is
+    # called up to 400 times a second.
     if isinstance(setpoint, LocalPositionSetpoint) and (here := context.session.telemetry.local_position.latest):
         north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
         return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > max_resting_m
@@ -225,7 +225,7 @@ class SetpointEncoder:
     def position(self, setpoint: PositionSetpoint, velocity: tuple[float, float, float] | None = None) -> Message:
         """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level.
 
-        ``velocity`` is the velocity at which the position itself moves, in m/s north, east, down.
+        ``velocity`` is the velocity of a moving target position, in m/s north, east, down.
         """
         mask, yaw, yaw_rate = _encode_yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION

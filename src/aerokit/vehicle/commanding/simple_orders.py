@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, Topic
+    from aerokit.vehicle.session.session import VehicleSession
 
 Firmware = Literal["ArduPilot", "ArduCopter", "ArduPlane", "Rover", "ArduSub", "PX4"]
 """Name of one firmware, or of an autopilot with all its firmwares."""
@@ -154,8 +155,8 @@ class SimpleOrder(Snapshot):
     ) -> None:
         """Send the command and wait for a status text that reports its effect.
 
-        ``is_done(text, seconds_since_ack)`` is called repeatedly for every text received so far, so it can accept a
-        text after some time. Only for orders without ``effect``.
+        ``is_done(text, seconds_since_ack)`` is called repeatedly for every text received so far, so it may accept a
+        text only some time after the acknowledgement. Only for orders without ``effect``.
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """
@@ -192,7 +193,7 @@ class SimpleOrder(Snapshot):
         target: int,
         timeout: float,
     ) -> None:
-        """Request the message until it reports the effect. Returns early if the vehicle does not have the message.
+        """Request ``effect.message`` until it reports the effect. Returns early if the vehicle does not send it at all.
 
         ``target`` is the id of the component that sends the message.
         """
@@ -247,6 +248,20 @@ async def _has_message(context: VehicleContext, message_id: int, component_id: i
     return True
 
 
+async def _is_request_refused(session: VehicleSession, message_id: int, component_id: int) -> bool:
+    """Request a message once. Returns True if the vehicle certainly refuses this request."""
+    may_get_late_ack = session.commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, component_id)
+    try:
+        await session.commands.send_long(
+            MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=1, attempt_timeout=0.5
+        )
+    except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
+        return False
+    except CommandRejected:
+        return not may_get_late_ack  # A late ack may be the refusal of an earlier request.
+    return False
+
+
 async def receive_once(
     context: VehicleContext, message_type: type[MessageT], component_id: int | None = None
 ) -> MessageT | None:
@@ -255,15 +270,7 @@ async def receive_once(
     target = session.component_id if component_id is None else component_id
     with session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages:
         for _ in range(RECEIVE_ATTEMPTS):
-            is_refused, is_doubtful = False, session.commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, target)
-            try:
-                await session.commands.send_long(
-                    MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=0.5
-                )
-            except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
-                pass
-            except CommandRejected:
-                is_refused = not is_doubtful  # The refusal of an earlier request does not count.
+            is_refused = await _is_request_refused(session, message_type.ID, target)
             with anyio.move_on_after(0 if is_refused else 0.5):
                 async for message in messages:  # Other components may send this message, too.
                     if message.received_frame is None or message.received_frame.component_id == target:

@@ -57,16 +57,16 @@ class StickStream(SteeringStream[StickInput]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
     Entering the block sends the initial positions for a second and then changes the mode. Leaving the block, also
-    by an exception, orders the vehicle to hold, except after a newer order or a takeover. ArduPilot is also told to
+    by an exception, orders the vehicle to hold, except after a newer order or a takeover. It also makes ArduPilot
     release the sticks. If the stream stops by itself (no new positions, a blocked event loop, a silent vehicle,
     another mode), the next ``set``, or else the end of the block, raises :class:`SetpointStreamStopped`.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s). ArduCopter without a
     transmitter executes the action of FS_THR_ENABLE after every end of a stream.
 
-    PX4 has no message that releases the sticks. COM_RC_LOSS_T (0.5 s) after every end of a stream, it treats the sticks
-    as lost. Without another source of manual control, it then executes NAV_RCL_ACT (return by default), even in hold
-    mode unless bit 1 of COM_RCL_EXCEPT is set.
+    PX4 has no message that releases the sticks. After every end of a stream, it waits for COM_RC_LOSS_T (0.5 s) and
+    then treats the sticks as lost. Without another source of manual control, it executes NAV_RCL_ACT (return by
+    default). To prevent this in hold mode, set bit 1 of COM_RCL_EXCEPT.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
@@ -124,13 +124,19 @@ class StickStream(SteeringStream[StickInput]):
 
     async def _check_support(self) -> None:
         if self._session.autopilot.name == "PX4":
-            source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
-            if source in (RC_ONLY, DISABLED):
-                raise OperationRejected(
-                    f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set COM_RC_IN_MODE to 1"
-                    " (MAVLink only) or 3 (transmitter or MAVLink)"
-                )
-            return
+            await self._check_px4_parameters()
+        else:
+            await self._check_ardupilot_parameters()
+
+    async def _check_px4_parameters(self) -> None:
+        source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
+        if source in (RC_ONLY, DISABLED):
+            raise OperationRejected(
+                f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set COM_RC_IN_MODE to 1"
+                " (MAVLink only) or 3 (transmitter or MAVLink)"
+            )
+
+    async def _check_ardupilot_parameters(self) -> None:
         values = await known_values(self._probe, "MAV_GCS_SYSID", "SYSID_MYGCS", "RC_OVERRIDE_TIME", "RC_OPTIONS")
         own_id = self._session.connection.source_system
         # Older versions of ArduPilot have SYSID_MYGCS instead of MAV_GCS_SYSID.

@@ -269,7 +269,7 @@ class SteeringStream(ValueStream[ValueT]):
         return self
 
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
-        """Order a hold. If the stream has stopped by itself, raise its error, unless it was raised before."""
+        """Order a hold. If the stream has already stopped, raise its error instead, unless it was raised before."""
         if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)
         if self._stop_error is None:
@@ -292,15 +292,18 @@ class SteeringStream(ValueStream[ValueT]):
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stop_error
         elif not self._session.telemetry.is_confirmed_disarmed:
-            cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
-            order = self._context.arbiter.order(hold_mode)
-            try:
-                with cleanup.flying(order):
-                    await cleanup.stop_in(hold_mode, order)
-            except (anyio.get_cancelled_exc_class(), OperationTimeout):
-                # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
-                cleanup.hold_in_background(order)
-                raise
+            await self._hold_and_wait()
+
+    async def _hold_and_wait(self) -> None:
+        cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
+        order = self._context.arbiter.order(hold_mode)
+        try:
+            with cleanup.flying(order):
+                await cleanup.stop_in(hold_mode, order)
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
+            cleanup.hold_in_background(order)
+            raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
         if self._needs_stream_before_mode:  # PX4 enters the mode only while it receives values.
@@ -377,7 +380,10 @@ class TakeoverCheck:
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:
-    """Return the values of those parameters that the vehicle has. Raises ParameterTimeout without an answer."""
+    """Read these parameters by ``probe``, and return the values of those that the vehicle has.
+
+    Raises ParameterTimeout if the vehicle does not answer.
+    """
     answers = await probe(*names)
     for answer in answers.values():
         if isinstance(answer, ParameterTimeout):

@@ -60,9 +60,9 @@ RESEND_INTERVAL_S = 1.0
 # The vehicle has arrived once it has been within the arrival radius for this many seconds.
 ARRIVED_FOR_S = 0.5
 
-# A direction is sent only for turns between these angles, for which the shorter way might be the wrong one. ArduPilot
-# measures the direction from its own target heading, so for other turns, a direction might cause almost a full circle
-# (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
+# aerokit sends a direction only for turns between these angles, for which the shorter way might be the wrong one. For
+# other turns, a direction might cause almost a full circle, because ArduPilot measures the turn from its own target
+# heading, not from the reported heading (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
 MIN_DIRECTED_TURN_DEG, MAX_DIRECTED_TURN_DEG = 170, 350
 
 # The command for a turn with a direction is sent only once, with this many seconds for its acknowledgement.
@@ -86,9 +86,9 @@ class TravelActions(VehicleBase):
     ) -> None:
         """Fly to a place and return on arrival.
 
-        After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is, unless another
-        order was given meanwhile or another party changed the mode. To a silent vehicle, the hold is sent after its
-        next heartbeat.
+        After a cancellation, a time-out or a silence, aerokit orders the vehicle to hold where it is; a silent vehicle
+        gets the hold after its next heartbeat. aerokit does not order the hold if another order was given meanwhile, or
+        another party changed the mode.
 
         Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not support this command.
@@ -97,7 +97,7 @@ class TravelActions(VehicleBase):
             target: latitude and longitude, and an altitude above the home of this vehicle or above mean sea level. If
                 it has both, the altitude above home is used. Caution: the position of another vehicle has an altitude
                 above the home of that vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the
-                present altitude is kept.
+                vehicle keeps its present altitude.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -162,10 +162,10 @@ class TravelActions(VehicleBase):
     async def _send_target(
         self, order: Order, place: dict[str, Any], yaw: float, speed_m_s: float | None
     ) -> SetPositionTargetGlobalInt | None:
-        """Send MAV_CMD_DO_REPOSITION. Returns None if it was acknowledged.
+        """Send MAV_CMD_DO_REPOSITION. Returns None if the vehicle acknowledged it.
 
-        A vehicle that does not support the command gets a SET_POSITION_TARGET_GLOBAL_INT. The vehicle does not
-        acknowledge this message, so it is returned and must be repeated on the way.
+        If the vehicle does not support the command, sends and returns a SET_POSITION_TARGET_GLOBAL_INT. The caller must
+        repeat this message on the way, because the vehicle does not acknowledge it.
         """
         # -1 leaves the speed to the vehicle.
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
@@ -248,7 +248,7 @@ class TravelActions(VehicleBase):
         way.
 
         Raises:
-            InvalidArgument: an argument is out of range. Nothing was sent.
+            InvalidArgument: the speed is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
@@ -275,7 +275,7 @@ class TravelActions(VehicleBase):
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
                 left. The vehicle turns the shorter way, but ArduPilot turns relative angles of ±170 to ±350 degrees in
                 the direction of their sign.
-            relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
+            relative: True to turn by an angle from the present heading; 360 and −360 cause no turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
@@ -403,7 +403,8 @@ class TravelActions(VehicleBase):
     def distance_to(self, target: Position | Home) -> float:
         """Return the distance to ``target`` in metres; infinite while the position is unknown.
 
-        It is three-dimensional if both have an altitude of the same kind, otherwise along the ground.
+        The distance is three-dimensional if the vehicle's position and the target have an altitude of the same kind.
+        Otherwise it is measured along the ground.
         """
         return self._position.distance_to(position_with_altitude(target))
 

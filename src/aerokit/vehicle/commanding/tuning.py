@@ -80,12 +80,8 @@ class TuningActions(VehicleBase):
                     is_tuned = percent >= TUNED_PERCENT
                     await anyio.sleep(0 if is_tuned else POLL_INTERVAL_S)
                     self._sender.raise_if_ended(order)
-                    # The next poll would start another tuning if PX4 has ended this one in the meantime.
-                    if not is_tuned and self._age_of(answer) > MAX_ANSWER_AGE_S:
-                        raise CommandTimeout(
-                            "autotune: this program was blocked for too long and could not poll PX4; PX4 may go on"
-                            " tuning"
-                        )
+                    if not is_tuned:
+                        self._raise_if_too_old(answer)
         finally:
             detach()
 
@@ -103,8 +99,12 @@ class TuningActions(VehicleBase):
         link = self._session.describe_link()
         raise CommandTimeout(f"autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning; {link}")
 
-    def _age_of(self, answer: CommandAck) -> float:
-        """Return the seconds since the answer was received, including the time for which the computer slept."""
+    def _raise_if_too_old(self, answer: CommandAck) -> None:
+        # If PX4 has ended this tuning since its answer, the next poll would start another one.
         frame = answer.received_frame
         received_at = self.connection.now() if frame is None else frame.received_at
-        return self.connection.now() - received_at + self.connection._slept_since(received_at)
+        age_s = self.connection.now() - received_at + self.connection._slept_since(received_at)
+        if age_s > MAX_ANSWER_AGE_S:
+            raise CommandTimeout(
+                "autotune: this program was blocked for too long and could not poll PX4; PX4 may go on tuning"
+            )

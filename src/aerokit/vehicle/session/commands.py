@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.connection.exchanges import ExchangeRun
 from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed
@@ -31,6 +31,17 @@ PENDING_ACK_TIMEOUT_S = 2.0
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""
+
+
+class _Options(NamedTuple):
+    """How a command is sent; see :meth:`CommandSender.send_long`."""
+
+    attempts: int | None
+    attempt_timeout: float | None
+    progress_timeout: float
+    on_progress: Callable[[int | None], None] | None
+    order_status: OrderStatus | None
+    was_just_sent: bool = False
 
 
 class CommandSender:
@@ -63,7 +74,8 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # Maps each command to the acks of earlier calls that may still arrive: the times at which they became pending.
+        # For each command: one entry per ack of earlier calls that may still arrive. The entry is the time since which
+        # no call waits for that ack.
         self._pending_acks: dict[_Key, list[float]] = {}
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
@@ -98,13 +110,13 @@ class CommandSender:
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack.
 
-        Pass ``was_just_sent=True`` if `send_unconfirmed` has just sent the command. It is then sent again only if no
-        ack arrives. See also :meth:`Vehicle.command`.
+        Pass ``was_just_sent=True`` if `send_unconfirmed` has just sent the command. This call then sends it again only
+        if no ack arrives. See also :meth:`Vehicle.command`.
         """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
-        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status)
-        return await self._run(message, *options, was_just_sent=was_just_sent)
+        options = _Options(attempts, attempt_timeout, progress_timeout, on_progress, order_status, was_just_sent)
+        return await self._run(message, options)
 
     async def send_int(
         self,
@@ -124,8 +136,8 @@ class CommandSender:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
         target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
-        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status)
-        return await self._run(message, *options)
+        options = _Options(attempts, attempt_timeout, progress_timeout, on_progress, order_status)
+        return await self._run(message, options)
 
     async def send_place(
         self,
@@ -137,7 +149,7 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a position, as COMMAND_LONG if COMMAND_INT is unsupported.
+        """Send a command with a position as COMMAND_INT. If the firmware does not support that, send a COMMAND_LONG.
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees. ``z`` is in metres above mean sea level.
         COMMAND_LONG has no frame, so use this only if the command's altitude is always AMSL, as for DO_SET_HOME.
@@ -160,7 +172,7 @@ class CommandSender:
         """Send a COMMAND_LONG once without waiting for its ack. For code that cannot await."""
         target = self._component_id if component_id is None else component_id
         self._connection.send(command_long(self._system_id, target, command, params))
-        self._expect_acks((target, command), self._acks_of(command))
+        self._add_pending_acks((target, command), [self._connection.now()] * self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
         # An ack without a target (0) counts too. MAVLink 1 and old firmware send no target.
@@ -180,7 +192,7 @@ class CommandSender:
         """Return True if an earlier transmission of this command may still be answered."""
         # A command that is sent once would take such an ack for its own.
         earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
-        return any(recorded_at >= earliest for recorded_at in self._pending_acks.get((component_id, command), ()))
+        return any(since >= earliest for since in self._pending_acks.get((component_id, command), ()))
 
     def accepted_at(self, command: int) -> float:
         """Return the time of the autopilot's last ACCEPTED ack to us, or −inf if there was none."""
@@ -203,19 +215,11 @@ class CommandSender:
         # A rebooted vehicle may support other commands.
         self._results.clear()
 
-    async def _run(
-        self,
-        message: CommandLong | CommandInt,
-        attempts: int | None,
-        attempt_timeout: float | None,
-        progress_timeout: float,
-        on_progress: Callable[[int | None], None] | None,
-        order_status: OrderStatus | None,
-        was_just_sent: bool = False,
-    ) -> CommandAck:
+    async def _run(self, message: CommandLong | CommandInt, options: _Options) -> CommandAck:
         """Send a command and return its ACCEPTED ack. Waits for earlier calls of the same command."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
+        order_status, was_just_sent = options.order_status, options.was_just_sent
         self._abort_run_of_ended_order(key)
         # A caller may send a command for an order that has already ended. If the order ends later, while this call
         # waits for the lock, the command is not sent.
@@ -230,19 +234,19 @@ class CommandSender:
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
-                # The acks that `send_unconfirmed` has recorded as pending belong to this call. If they have arrived
-                # already, the command is repeated. This is harmless, because only commands that stop or release
-                # something are sent this way.
+                # `send_unconfirmed` has recorded the acks of its transmission as pending, but this call waits for them.
+                # If they have arrived already, this call sends the command again. This is harmless, because only
+                # commands that stop or release something are sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
                 own_system=self._connection.source_system,
                 own_component=self._connection.source_component,
-                attempts=attempts,
-                attempt_timeout=attempt_timeout,
+                attempts=options.attempts,
+                attempt_timeout=options.attempt_timeout,
                 min_timeout_s=self._min_attempt_timeout_s(),
-                progress_timeout=progress_timeout,
-                on_progress=on_progress,
+                progress_timeout=options.progress_timeout,
+                on_progress=options.on_progress,
                 earlier_answers=len(pending_acks),
                 acks_per_sending=acks_per_sending,
                 order_status=order_status,
@@ -261,7 +265,8 @@ class CommandSender:
                 # Acks arrive in the order of their commands. The acks received so far therefore belong to the oldest
                 # pending commands.
                 still_pending = pending_acks[exchange.answers :]
-                self._expect_acks(key, exchange.pending_answers, still_pending)
+                newly_pending = [self._connection.now()] * exchange.pending_answers
+                self._add_pending_acks(key, [*still_pending, *newly_pending])
 
     def _abort_run_of_ended_order(self, key: _Key) -> None:
         order_status = self._order_statuses.get(key)
@@ -279,24 +284,26 @@ class CommandSender:
         # PX4 sends two acks for some commands.
         return self._acks_per_command.get(command, 1)
 
-    def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
-        """Record acks that may still arrive, so that the next command ignores them.
-
-        ``count`` is the number of acks that the last command may still get. ``earlier_records`` are those from
-        :meth:`_pop_pending_acks` whose acks have still not arrived.
-        """
-        new_records = [self._connection.now()] * count
-        if earlier_records or new_records:
-            self._pending_acks.setdefault(key, []).extend([*earlier_records, *new_records])
+    def _add_pending_acks(self, key: _Key, pending_since: Sequence[float]) -> None:
+        """Record acks that may still arrive, each by a time, so that the next command ignores them."""
+        if pending_since:
+            self._pending_acks.setdefault(key, []).extend(pending_since)
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
         """Remove the pending acks, and return the times of those that may still arrive."""
         lost_before = self._connection.now() - PENDING_ACK_TIMEOUT_S
-        return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= lost_before]
+        return [since for since in self._pending_acks.pop(key, ()) if since >= lost_before]
 
     def _abort(self, error: Exception) -> None:
         for run in tuple(self._runs.values()):
             run.abort(error)
+
+    def _record_result(self, key: _Key, ack: CommandAck) -> None:
+        self._results[key] = ack.result
+        if ack.result != MavResult.ACCEPTED:
+            self._refused_at[key] = self._connection.now()
+        elif self._is_for_our_ids(ack):
+            self._accepted_at[key] = self._connection.now()
 
     def _on_ack(self, ack: CommandAck) -> None:
         frame = ack.received_frame
@@ -305,11 +312,7 @@ class CommandSender:
         is_final = ack.result != MavResult.IN_PROGRESS
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_answer and is_final:
-            self._results[key] = ack.result
-            if ack.result == MavResult.ACCEPTED and self._is_for_our_ids(ack):
-                self._accepted_at[key] = self._connection.now()
-            if ack.result != MavResult.ACCEPTED:
-                self._refused_at[key] = self._connection.now()
+            self._record_result(key, ack)
         if run is not None:
             run.receive(ack)
         elif is_answer and is_final:

@@ -100,9 +100,21 @@ class _Stream:
         self.counts_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
         self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
 
+    def postpone(self, now: float) -> None:
+        """Wait longer before the next request, because this one was not answered."""
+        self.failures += 1
+        self.next_attempt_at = now + min(2**self.failures, MAX_RETRY_INTERVAL_S)
+
     def on_frame(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
             self.received += 1
+
+
+def _is_slow(achieved_hz: float, requested_hz: float) -> bool:
+    window_s = WATCH_WINDOW * WATCH_PERIOD_S
+    received_messages = achieved_hz * window_s
+    # One message may be missing, because it may have arrived just outside the window.
+    return received_messages < SLOW_FACTOR * requested_hz * window_s - 1
 
 
 class MessageRates:
@@ -139,8 +151,8 @@ class MessageRates:
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request a message at ``hz`` or faster until the returned function is called.
 
-        The rate is above 0 and at most 1000. ``is_optional`` means that the vehicle may lack the message, for example
-        because it lacks the sensor. A missing message is reported only if a request for it is not optional.
+        The rate is above 0 and at most 1000. Pass ``is_optional=True`` if the vehicle may lack the message, for example
+        because it has no such sensor. If all requests for a message are optional, no event reports that it is missing.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
@@ -237,9 +249,7 @@ class MessageRates:
         except CommandTimeout:
             # A failure from before a call of `request_again` does not count.
             if reset_count == self._reset_count:
-                stream.failures += 1
-                interval_s = min(2**stream.failures, MAX_RETRY_INTERVAL_S)
-                stream.next_attempt_at = self._connection.now() + interval_s
+                stream.postpone(self._connection.now())
             return
         if reset_count != self._reset_count:
             # `request_again` was called meanwhile. The answer may be from before a reboot, so the stream stays due.
@@ -324,19 +334,14 @@ class MessageRates:
         if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
+        if achieved_hz == 0 and stream.is_optional:  # An optional stream need not exist.
+            return
         # If no message arrived in the first period of the window, the stream began later. Its average is then too low.
         has_just_started = achieved_hz > 0 and stream.counts_at_checks[0] == stream.counts_at_checks[1]
         if has_just_started and not stream.is_slow:
             return
-        # A stream that lacks only one message is not slow, because that message may have arrived just outside the
-        # window.
-        window_s = WATCH_WINDOW * WATCH_PERIOD_S
-        min_messages = SLOW_FACTOR * stream.requested_hz * window_s - 1
-        received_messages = achieved_hz * window_s
-        if achieved_hz == 0 and stream.is_optional:  # An optional stream need not exist.
-            return
         was_slow = stream.is_slow
-        stream.is_slow = received_messages < min_messages
+        stream.is_slow = _is_slow(achieved_hz, stream.requested_hz)
         if stream.is_slow and not was_slow:
             self._connection.bus.publish(
                 StreamSlow(

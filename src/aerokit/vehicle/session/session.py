@@ -64,7 +64,8 @@ RETRY_INTERVAL_S = 3.0
 # it may belong to an earlier request, because PX4 acknowledges a command over each of its ports.
 MAX_MODE_REQUESTS = 3
 
-# The first requests for the version are sent quickly: their number, and the interval in seconds.
+# At first, the version is requested up to EAGER_REQUESTS times in quick succession, with EAGER_INTERVAL_S seconds for
+# each acknowledgement, and as long again for the message.
 EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
@@ -114,9 +115,11 @@ async def _request(commands: CommandSender, message_id: int, *, attempt_timeout:
 STATUS_TEXT_DELAY_S = 0.3
 """Seconds to wait for status texts after a refusal."""
 
-# It divides the 10 Hz of the position, so that these messages share datagrams with the position.
 ACTION_HZ = 5.0
-"""Rate in Hz of the messages that an action waits for."""
+"""Rate in Hz of the messages that an action waits for.
+
+The position has 10 Hz. Because 5 divides 10, these messages share datagrams with the position.
+"""
 
 RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
 
@@ -192,7 +195,7 @@ class VehicleSession:
 
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         self.telemetry.receive(heartbeat)
-        # A missing message is reported only if the program has named it.
+        # Only messages that the program itself has named are reported as missing.
         are_default = rates is None
         requested_rates = self.telemetry.default_rates if rates is None else rates
         for message_type, hz in requested_rates.items():
@@ -261,7 +264,7 @@ class VehicleSession:
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
         """Raise OperationRejected unless the vehicle is known to be disarmed.
 
-        Pass ``is_current=False`` if the last HEARTBEAT is too old; the call then always raises.
+        Pass ``is_current=False`` if the last HEARTBEAT is too old to show this; the call then always raises.
         """
         if not self.telemetry.is_confirmed_disarmed or not is_current:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
@@ -330,7 +333,7 @@ class VehicleSession:
         return tuple(reasons.values())
 
     def texts_since(self, at: float) -> tuple[str, ...]:
-        """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
+        """Return the status texts (STATUSTEXT) received since ``at``, a time of the loop's clock, oldest first."""
         return tuple(text.text for text in self.telemetry.texts_since(at))
 
     @property
@@ -358,6 +361,19 @@ class VehicleSession:
         self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
 
     def _attach_telemetry(self) -> None:
+        bus = self.connection.bus
+        self._attach_messages()
+        self._attach_watched_streams()
+        self.add_timeout_hint(*self.telemetry.cells.values(), self.link_quality, self.watch.link_state)
+        self._detach_callbacks += [
+            *self._publish_changes(),
+            bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
+            bus.attach_event(LinkSelected, self._on_link_selected),
+            bus.attach_event(ComputerSlept, self._on_computer_slept),
+            self.connection.on_end(self._on_end),
+        ]
+
+    def _attach_messages(self) -> None:
         bus, streams = self.connection.bus, self.telemetry.streams
         for message_id, handler in self.telemetry.handles.items():
             message_type = bus.dialect.get(message_id)
@@ -368,10 +384,11 @@ class VehicleSession:
             else:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self._detach_callbacks.append(detach)
+
+    def _publish_changes(self) -> list[Detach]:
+        """Publish changes of states as events, until the returned functions are called."""
         telemetry, publish = self.telemetry, self.publish
-        self._attach_watched_streams()
-        self.add_timeout_hint(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
-        self._detach_callbacks += [
+        return [
             telemetry.mode.observe(
                 lambda before, mode: publish(ModeChanged, None if before is None else before.name, mode.name)
             ),
@@ -380,10 +397,6 @@ class VehicleSession:
             telemetry.status_text.observe(
                 lambda _, text: publish(StatusTextReceived, text.severity, text.text), every_arrival=True
             ),
-            bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
-            bus.attach_event(LinkSelected, self._on_link_selected),
-            bus.attach_event(ComputerSlept, self._on_computer_slept),
-            self.connection.on_end(self._on_end),
         ]
 
     def _attach_watched_streams(self) -> None:

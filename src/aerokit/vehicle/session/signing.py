@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 
-# SETUP_SIGNING is repeated at the interval of the vehicle's HEARTBEAT. The signature of HEARTBEAT shows whether the
+# SETUP_SIGNING is repeated only once per HEARTBEAT (1 Hz), because the signature of a HEARTBEAT shows whether the
 # vehicle has accepted the key.
 RETRY_INTERVAL_S = 1.0
 
@@ -26,7 +26,7 @@ TIMESTAMP_TICKS_PER_S = 100_000
 
 
 async def set_up_signing(session: VehicleSession, signing: Signing | None, timeout: float) -> None:
-    """Send SETUP_SIGNING until the vehicle signs with the key, or no longer signs."""
+    """Send SETUP_SIGNING until the vehicle signs with the key. With None, until the vehicle no longer signs."""
     _check_vehicle(session)
     connection, started = session.connection, session.connection.now()
     with connection._signatures.key_handover(signing, session.system_id, session.component_id) as has_accepted:
@@ -62,7 +62,7 @@ def _check_vehicle(session: VehicleSession) -> None:
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, initial_timestamp=0)
-    # The vehicle's time stamps continue from this `timestamp`. It is a second ahead of our clock, because frames that
-    # are not later than those already received would be refused as replayed.
+    # A receiver refuses a frame as replayed if its time stamp is not later than the last one. The vehicle continues
+    # from this time stamp, which is therefore a second ahead of our clock.
     timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
     return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)

@@ -145,9 +145,9 @@ class Transfers:
             raise OperationTimeout(f"the operation was not done within {timeout:g} s; {self._describe()}")
 
     def command_in_background(self, command: int, *params: float, was_just_sent: bool = False) -> None:
-        """Send an optional command without waiting for its ack. Failures are ignored.
+        """Send an optional command without waiting for its ack, and ignore failures.
 
-        If the caller has just sent the command (``was_just_sent``), it is sent again only if no ack arrives.
+        With ``was_just_sent``, the caller has sent the command already, so it is sent again only if no ack arrives.
         """
         send = self._send_command
 

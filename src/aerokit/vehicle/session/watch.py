@@ -37,16 +37,23 @@ REBOOT_MIN_DECREASE_MS = 3000
 # A decreased time shows a reboot only if it persists for this long and in at least two messages, because a single
 # message may be late.
 REBOOT_CONFIRM_S = 0.2
-# An expected reboot is detected when the vehicle's clock is behind its expected time by more than this. A boot takes
-# longer than this, and messages are delayed by less.
+# After a reboot was ordered, a clock that lags behind by more than this shows that the vehicle has rebooted. A boot
+# takes longer than this, and messages are delayed by less.
 EXPECTED_REBOOT_MIN_LAG_MS = 2000
-# A simulation's clock may be faster than real time. Its speed is computed once the first and the last reported time
-# differ by this many seconds.
+# A simulation's clock may be faster than real time. Its speed is computed once this many seconds lie between the first
+# and the last report.
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
 # Maximum number of unanswered TIMESYNC requests; older ones are considered lost.
 MAX_OPEN_REQUESTS = 64
+
+
+class _ClockReading(NamedTuple):
+    """A time since boot that the vehicle has reported, and our time at which the report was processed."""
+
+    milliseconds: int
+    read_at: float
 
 
 class VehicleWatch:
@@ -67,8 +74,8 @@ class VehicleWatch:
         self._on_reboot = on_reboot
         # Time at which the last HEARTBEAT arrived.
         self.last_heartbeat_at: float = heartbeat_at
-        # Time at which the last HEARTBEAT was processed. The HEARTBEAT that found the vehicle may be old; the minimum
-        # keeps the vehicle from being silent at once.
+        # Time at which the last HEARTBEAT was processed. The first HEARTBEAT may be old, but the vehicle must not count
+        # as silent at once.
         self._heartbeat_read_at = max(self.last_heartbeat_at, connection.now() - SILENT_AFTER_S)
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
         self._state_tracker = LinkStateTracker(
@@ -80,18 +87,18 @@ class VehicleWatch:
         self._has_ended = False
         self.reboots: int = 0
         """Number of reboots detected."""
-        # Maps each clock of the vehicle to its last reported time in milliseconds, and when the report was processed.
-        self._last_times: dict[str, tuple[int, float]] = {}
-        # The first ``time_boot_ms`` that was received since the start or a reboot, and when it was processed.
-        self._first_time: tuple[int, float] | None = None
-        # By this clock, the connection recognises a vehicle that returns from a new address.
+        # The last reading of each clock of the vehicle.
+        self._last_readings: dict[str, _ClockReading] = {}
+        # The first reading of ``time_boot_ms`` since the start of the session or a reboot.
+        self._first_reading: _ClockReading | None = None
+        # The connection uses this clock to recognise a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # Maps each clock whose time has decreased to the lowest time (ms), and to our time when it was processed.
-        # `_is_decrease_confirmed` decides whether this shows a reboot.
-        self._decreased_times: dict[str, tuple[int, float]] = {}
+        # The lowest reading of each clock whose time has decreased, until `_is_decrease_confirmed` has decided whether
+        # the decrease shows a reboot.
+        self._decreased_readings: dict[str, _ClockReading] = {}
         self._expects_reboot = False
-        # The last answer to a TIMESYNC request: our time when it was processed, and the vehicle's time (ms).
-        self._last_answer = (-math.inf, 0)
+        # The vehicle's time in the last answer to a TIMESYNC request.
+        self._last_answer = _ClockReading(0, read_at=-math.inf)
         attach = connection.bus.attach
         self._detach_callbacks: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
         attach_frames = connection.bus.attach_frames
@@ -111,10 +118,7 @@ class VehicleWatch:
 
     @property
     def silent_for_s(self) -> float:
-        """Seconds since the last heartbeat was processed.
-
-        It may have arrived earlier, at :attr:`last_heartbeat_at`.
-        """
+        """Seconds since aerokit processed the last heartbeat, which arrived at :attr:`last_heartbeat_at`."""
         # A pause in which the event loop was blocked must not count as silence.
         return self._connection.now() - self._heartbeat_read_at
 
@@ -131,14 +135,13 @@ class VehicleWatch:
 
     def boot_time_ms(self, now: float) -> float | None:
         """Return the vehicle's time since boot at ``now``, or None if it is unknown."""
-        if "time_boot_ms" not in self._last_times or self._first_time is None:
+        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
+        if first is None or last is None:
             return None
-        last_ms, last_at = self._last_times["time_boot_ms"]
-        first_ms, first_at = self._first_time
-        span_s = last_at - first_at
+        span_s = last.read_at - first.read_at
         # The clock of a simulation may be faster than real time.
-        ms_per_second = (last_ms - first_ms) / span_s if span_s > CLOCK_SPAN_S else 1000.0
-        return last_ms + ms_per_second * (now - last_at)
+        ms_per_second = (last.milliseconds - first.milliseconds) / span_s if span_s > CLOCK_SPAN_S else 1000.0
+        return last.milliseconds + ms_per_second * (now - last.read_at)
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
@@ -151,12 +154,12 @@ class VehicleWatch:
 
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Detect a reboot by the time since boot in an answer to our TIMESYNC request."""
-        answered_at, milliseconds_before = self._last_answer
+        previous = self._last_answer
         # If the request was sent before the previous answer arrived, the answers may be in the wrong order.
-        if requested_at <= answered_at:
+        if requested_at <= previous.read_at:
             return
-        self._last_answer = (self._connection.now(), milliseconds)
-        if milliseconds < milliseconds_before:
+        self._last_answer = _ClockReading(milliseconds, self._connection.now())
+        if milliseconds < previous.milliseconds:
             self._on_reboot_detected("TIMESYNC", milliseconds)
 
     def check(self) -> None:
@@ -205,38 +208,38 @@ class VehicleWatch:
 
         ``clock`` names the message or field with the time.
         """
-        now = self._now()
-        milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
-        # How far the vehicle's clock is behind its expected time. A delay of either message changes the result;
-        # `EXPECTED_REBOOT_MIN_LAG_MS` allows for that.
-        behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
+        reading = _ClockReading(milliseconds, self._now())
+        previous = self._last_readings.get(clock, reading)
+        # How far the vehicle's clock is behind its expected time. If this or the previous message was late, the result
+        # is wrong by the delay; `EXPECTED_REBOOT_MIN_LAG_MS` allows for that.
+        behind_ms = 1000 * (frame.received_at - previous.read_at) - (milliseconds - previous.milliseconds)
         if self._expects_reboot and behind_ms > EXPECTED_REBOOT_MIN_LAG_MS:
             self._on_reboot_detected(clock, milliseconds)
-        elif milliseconds_before - milliseconds <= REBOOT_MIN_DECREASE_MS:  # The decrease is too small for a reboot.
-            self._last_times[clock] = (milliseconds, now)
-            if self._first_time is None and clock == "time_boot_ms":
-                self._first_time = (milliseconds, now)
-            if self._decreased_times:  # The time has increased again, so the decreased time came from a late message.
-                self._decreased_times.pop(clock, None)
+        elif previous.milliseconds - milliseconds <= REBOOT_MIN_DECREASE_MS:  # The decrease is too small for a reboot.
+            self._last_readings[clock] = reading
+            if self._first_reading is None and clock == "time_boot_ms":
+                self._first_reading = reading
+            # If an earlier message reported a far smaller time, that message was late.
+            self._decreased_readings.pop(clock, None)
         elif self._is_decrease_confirmed(clock, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
 
     def _is_decrease_confirmed(self, clock: str, milliseconds: int) -> bool:
-        """Return True if the time decreased ``REBOOT_CONFIRM_S`` ago and has advanced since."""
-        now = self._connection.now()
-        decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
-        if milliseconds < decreased_ms:  # The time has decreased further, so the confirmation starts again.
-            self._decreased_times[clock] = (milliseconds, now)
+        """Return True if the time decreased at least ``REBOOT_CONFIRM_S`` ago and has advanced since."""
+        reading = _ClockReading(milliseconds, self._connection.now())
+        lowest = self._decreased_readings.setdefault(clock, reading)
+        if milliseconds < lowest.milliseconds:  # The time has decreased further, so the confirmation starts again.
+            self._decreased_readings[clock] = reading
             return False
-        return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
+        return milliseconds > lowest.milliseconds and reading.read_at - lowest.read_at >= REBOOT_CONFIRM_S
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        # Discard older times. A comparison with them would show the same reboot again.
-        self._last_times = {clock: (milliseconds, now)}
-        self._decreased_times = {}
-        self._first_time = None
-        self._last_answer = (now, 0)
+        # Discard older readings. A comparison with them would show the same reboot again.
+        self._last_readings = {clock: _ClockReading(milliseconds, now)}
+        self._decreased_readings = {}
+        self._first_reading = None
+        self._last_answer = _ClockReading(0, now)
         self._expects_reboot = False
         self.reboots += 1
         self._on_reboot()
@@ -270,10 +273,10 @@ class LinkWatch:
         self._system_id = system_id
         self._component_id = component_id
         self._on_report = on_report
-        # Called for each answer with our time of the request and the vehicle's time in milliseconds.
+        # Called with each TIMESYNC answer: our time of the request (s), and the vehicle's time (ms).
         self._on_answer = on_answer
         self._round_trip_s: float | None = None
-        # Times of the unanswered TIMESYNC requests in nanoseconds, which identify their answers.
+        # The times (ns) in the unanswered TIMESYNC requests. Each answer repeats the time of its request.
         self._open_requests: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
         self._next_request_at = connection.now()
         # The counters at the last report.
