@@ -216,7 +216,7 @@ class Routes:
         return route is not None and route.peer != peer
 
     def try_move_route(self, frame: Frame, peer: Peer, *, is_signed: bool) -> bool:
-        """Move the route of the frame's sender to ``peer``, which does not own it, if that is allowed.
+        """Move the route of the frame's sender from its owner to ``peer``, if that is allowed.
 
         Returns True if the route was moved. ``is_signed`` is True if the frame is signed with our key.
         """

@@ -49,9 +49,9 @@ _NOISE = 5
 # Position of a valid frame, and parts of its header: (begin, end, message id, sequence number, source).
 _ValidFrame = tuple[int, int, int, int, int]
 
-# Findings about the data kept for the next call, which continues with them:
+# State of a scan, from which the next call continues:
 # - the position up to which the data was examined;
-# - the possible frames: (begin, verdict, size of the data at which to examine the frame again);
+# - the possible frames: (begin, verdict, number of bytes that must have arrived before it is examined again);
 # - the positions of frames with a wrong checksum.
 _ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
 _NEW_SCAN: _ScanState = (0, [], [])

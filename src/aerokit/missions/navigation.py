@@ -533,6 +533,8 @@ def loiter_to_altitude(
 ) -> MissionItem:
     """Circle at a place until the altitude is reached. A negative ``radius_m`` means counter-clockwise.
 
+    The place is a Position, a Home, or a latitude and a longitude.
+
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TO_ALT
     """
     return place_item(

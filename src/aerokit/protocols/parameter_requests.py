@@ -266,7 +266,7 @@ class ParameterWrites(ParameterRequests):
             self._window.on_answer(name, now)
             self._window.request(name)
             return
-        # The requested value with another type must be reported twice.
+        # The requested value with another type is accepted when it is reported a second time.
         if is_as_requested and (reported.type == requested.type or answers.ends_with(reported)):
             self._window.on_answer(name, now)
             self._set_result(name, reported, now)

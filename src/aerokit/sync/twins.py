@@ -3576,7 +3576,7 @@ class Settings(TwinOf["AsyncSettings"]):
         return self._loop.call(self.aio.options, name)
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """Return the options of other settings that exclude a setting now, for example ``("CAM_EXPMODE = Auto",)``."""
+        """Return the values of other settings that make a setting unavailable now, e.g. ``("CAM_EXPMODE = Auto",)``."""
         return self._loop.call(self.aio.excluded_by, name)
 
     def download(
@@ -4214,7 +4214,7 @@ class Vehicle(VehicleTwin):
 
         If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
         as :meth:`command` does. A set-point, a guided mission item or MISSION_SET_CURRENT does not end the action in
-        progress, but it ends orders about motion that :meth:`posted` has opened. A message to another system ends
+        progress, only the orders about motion that were given by :meth:`posted`. A message to another system ends
         nothing.
 
         Raises:

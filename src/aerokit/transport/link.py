@@ -196,7 +196,7 @@ class BaseLink(Link):
         self.address = address
         self.dropped_writes: int = 0
         self._state = _State.NEW
-        self._receiver: Receiver | None = None  # None before the opening and after the end, when no callback runs
+        self._receiver: Receiver | None = None  # None before the link is opened and after it has ended
         self._keeps_peers = False  # True if the receiver decides which peers are remembered; see `PeerKeeper`
         self._stalled_at: float | None = None  # time at which the link stalled; None while it is not stalled
         self._released = asyncio.Event()  # set while no socket is open

@@ -91,7 +91,8 @@ class LinkCounter:
             received: number of frames since the last call, including this one.
         """
         if expected < 0:
-            self._second = int(time_s)  # nothing is known to be lost before the first frame
+            self._second = int(time_s)
+        # Losses before the first frame are unknown.
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
             missing = 0

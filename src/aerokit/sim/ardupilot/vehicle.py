@@ -236,9 +236,9 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Return True if the autopilot processes a message. Messages to `components` or other systems return False.
+        """Return True unless a message is for another system, or for one of the other `components` of this vehicle.
 
-        As in the firmware (MAVLink_routing.cpp), messages to an unknown component return True.
+        As in the firmware (MAVLink_routing.cpp), the autopilot also processes messages to unknown components.
         """
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and all(component != present.component_id for present in self.components)

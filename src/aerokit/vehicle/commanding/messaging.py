@@ -244,7 +244,7 @@ class MessagingActions(VehicleBase):
 
         If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
         as :meth:`command` does. A set-point, a guided mission item or MISSION_SET_CURRENT does not end the action in
-        progress, but it ends orders about motion that :meth:`posted` has opened. A message to another system ends
+        progress, only the orders about motion that were given by :meth:`posted`. A message to another system ends
         nothing.
 
         Raises:

@@ -226,7 +226,7 @@ class Order:
 
     @property
     def is_effect_due(self) -> bool:
-        """True while HEARTBEAT may still report the effect of the order."""
+        """True if a later HEARTBEAT may show that the order took effect."""
         return self.was_sent and not (self.is_confirmed or self.was_refused or self.takeover_reason)
 
     def is_own(self, mode: Mode) -> bool:

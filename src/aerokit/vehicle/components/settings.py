@@ -167,7 +167,7 @@ class Settings:
         return MappingProxyType({option.name: option.value for option in options})
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """Return the options of other settings that exclude a setting now, for example ``("CAM_EXPMODE = Auto",)``."""
+        """Return the values of other settings that make a setting unavailable now, e.g. ``("CAM_EXPMODE = Auto",)``."""
         return () if self._definition is None else self._definition.excluded_by(name, self._values())
 
     async def download(
