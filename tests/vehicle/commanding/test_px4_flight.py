@@ -19,6 +19,7 @@ from aerokit.dronekit import flight_orders
 from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.px4.modes import POSITION, custom_mode
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
 
@@ -362,3 +363,14 @@ async def test_mode_refused_after_acceptance_is_not_flown_by_program(flying: Px4
     with pytest.raises(CommandRejected, match="accepted the command and then refused it"):
         await flying.vehicle.set_mode("OFFBOARD")
     assert not flying.vehicle.is_flown_by_program
+
+
+@pytest.mark.parametrize("phase_s", [0.0, 0.25, 0.5])
+async def test_lost_hold_after_setpoints_is_repeated_before_failsafe(phase_s: float) -> None:
+    async with open_px4() as flight:
+        await flight.take_off(10.0)
+        async with flight.vehicle.guided.velocity() as stream:
+            await stream.fly(VelocitySetpoint(north_m_s=2.0), 3.0 + phase_s)
+            flight.px4.faults.ignore(MavCmd.DO_REPOSITION, times=1)
+        await anyio.sleep(3.0)
+        assert flight.vehicle.mode_name == "LOITER"

@@ -98,8 +98,7 @@ HOLD_CLOSE_TIMEOUT_S = 1.5
 # Maximum number of attempts to hold after an abandoned order. After a time-out, the next attempt waits for a HEARTBEAT.
 MAX_HOLD_ATTEMPTS = 3
 
-# A hold that was sent without waiting is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most
-# MAX_HOLD_RESENDS times.
+# A hold is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most MAX_HOLD_RESENDS times.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
 # NaN means the present position, so the vehicle brakes and does not fly back to a point that it has passed.
@@ -131,7 +130,10 @@ class FlightCleanup:
         """Order the vehicle to hold, even if it already is in the hold mode."""
         order.only_stops = True
         if self._holds_by_reposition:  # PX4 may be flying to a place in LOITER, its hold mode.
-            await self._sender.send_long(order, *STOP_HERE)
+            # PX4 acts on the loss of set-points after 1 s (COM_OF_LOSS_T), so a lost hold is repeated earlier.
+            await self._sender.send_long(
+                order, *STOP_HERE, attempt_timeout=HOLD_ACK_TIMEOUT_S, attempts=MAX_HOLD_RESENDS
+            )
             await self._sender.ensure_mode(mode, order)
         else:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
