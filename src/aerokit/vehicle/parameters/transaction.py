@@ -40,7 +40,7 @@ class RestoreRegistry:
         self._lock = asyncio.Lock()
 
     @asynccontextmanager
-    async def turn(self, timeout: float | None = None) -> AsyncIterator[None]:
+    async def exclusive(self, timeout: float | None = None) -> AsyncIterator[None]:
         """Wait until no other block saves or restores values, at most ``timeout`` seconds.
 
         A block that begins while another one restores its parameters would save, and later restore, temporary values.
@@ -86,7 +86,7 @@ class _Block:
         """Resolve names, and save the parameters as they are before their first write."""
         # The writer calls this method before each round of writes, because some parameters appear only after the first
         # round.
-        async with self._registry.turn():
+        async with self._registry.exclusive():
             return await self._resolve_and_save_locked(names, idle_timeout_s)
 
     async def _resolve_and_save_locked(
@@ -152,7 +152,7 @@ class _Block:
         reason = ""
         with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
             # Another block may wait long for an answer. That must not prevent this one from restoring its values.
-            async with self._registry.turn(self._idle_timeout_s):
+            async with self._registry.exclusive(self._idle_timeout_s):
                 saved = self._take_saved()
                 try:
                     names = [param.name for param in saved if self._access.written.get(param.name) is not None]
