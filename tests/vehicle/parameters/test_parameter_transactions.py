@@ -16,6 +16,7 @@ from aerokit.errors import (
     LinkLost,
     OperationTimeout,
     ParameterRejected,
+    ParameterTimeout,
     RollbackFailed,
     VerificationFailed,
 )
@@ -263,6 +264,48 @@ async def test_block_end_is_bounded_for_silent_vehicle() -> None:
                 ended = loop.time()
         assert failed.value.not_restored == {"RTL_ALT": 1500}
         assert loop.time() - ended == pytest.approx(2.0, abs=0.1)
+
+
+async def test_ends_of_several_blocks_are_bounded_for_silent_vehicle() -> None:
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        parameters, loop = flight.vehicle.parameters, asyncio.get_running_loop()
+        not_restored: dict[str, float] = {}
+        ended_at = loop.time() + 10.0
+
+        async def change(name: str) -> None:
+            with pytest.raises(RollbackFailed) as failed:
+                async with parameters.temporarily({name: flight.copter.parameters[name] + 1}, idle_timeout_s=2.0):
+                    await anyio.sleep(ended_at - loop.time())
+            not_restored.update(failed.value.not_restored)
+            assert loop.time() - ended_at <= 6.1
+
+        names = ("RTL_ALT", "LAND_SPEED", "RTL_SPEED", "WPNAV_SPEED", "LOIT_SPEED")
+        before = {name: flight.copter.parameters[name] for name in names}
+        for name in before:
+            tasks.start_soon(change, name)
+        await anyio.sleep(9.0)
+        flight.copter.faults.silent = True
+        await anyio.sleep(20.0)
+        assert not_restored == before
+
+
+async def test_block_restores_while_another_one_waits_for_answers() -> None:
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        parameters, loop = flight.vehicle.parameters, asyncio.get_running_loop()
+        await parameters.download()
+        flight.copter.faults.mute_parameters = {"LAND_SPEED"}
+
+        async def change() -> None:
+            with pytest.raises(ParameterTimeout):
+                async with parameters.temporarily({"LAND_SPEED": 60}, idle_timeout_s=30.0):
+                    pass
+
+        async with parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=2.0):
+            tasks.start_soon(change)
+            await anyio.sleep(1.0)
+            ended_at = loop.time()
+        assert values(flight) == BEFORE
+        assert loop.time() - ended_at <= 6.0
 
 
 async def test_temporary_block_is_entered_once() -> None:

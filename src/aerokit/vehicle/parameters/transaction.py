@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import anyio
@@ -36,9 +37,21 @@ class RestoreRegistry:
 
     def __init__(self) -> None:
         self._blocks: dict[str, list[_Block]] = {}
-        # Held while a block saves or restores values: a block that begins while another one restores its parameters
-        # would save, and later restore, temporary values.
-        self.lock: asyncio.Lock = asyncio.Lock()
+        self._lock = asyncio.Lock()
+
+    @asynccontextmanager
+    async def exclusive(self, timeout: float | None = None) -> AsyncIterator[None]:
+        """Wait until no other block saves or restores values, at most ``timeout`` seconds.
+
+        A block that begins while another one restores its parameters would save, and later restore, temporary values.
+        """
+        with anyio.move_on_after(timeout) as waiting:
+            await self._lock.acquire()
+        try:
+            yield
+        finally:
+            if not waiting.cancelled_caught:
+                self._lock.release()
 
     def add(self, name: str, block: _Block) -> None:
         self._blocks.setdefault(name, []).append(block)
@@ -73,7 +86,7 @@ class _Block:
         """Resolve names, and save the parameters as they are before their first write."""
         # The writer calls this method before each round of writes, because some parameters appear only after the first
         # round.
-        async with self._registry.lock:
+        async with self._registry.exclusive():
             return await self._resolve_and_save_locked(names, idle_timeout_s)
 
     async def _resolve_and_save_locked(
@@ -135,10 +148,12 @@ class _Block:
 
     async def _write_previous(self, cause: BaseException | None) -> None:
         answers: Mapping[str, object] = {}
+        saved: list[Parameter] = []
         reason = ""
-        async with self._registry.lock:
-            saved = self._take_saved()
-            with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
+        with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
+            # Another block may wait long for an answer. That must not prevent this one from restoring its values.
+            async with self._registry.exclusive(self._idle_timeout_s):
+                saved = self._take_saved()
                 try:
                     names = [param.name for param in saved if self._access.written.get(param.name) is not None]
                     present = await self._access.read(names, self._idle_timeout_s)
