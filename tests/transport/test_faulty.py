@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any
 
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from link_harness import Recorder, each_loop, each_traffic
 
 import aerokit
-from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
+from aerokit.errors import BusyError, CommandTimeout, ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.mavlink import FrameEncoder, messages
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import FaultModel, FaultyLink, run_virtual
@@ -476,7 +477,9 @@ def test_program_flies_over_a_bad_radio() -> None:
             async with aerokit.connect(radio) as vehicle:
                 await vehicle.wait_ready()
                 await vehicle.set_mode("GUIDED")
-                await vehicle.arm()
+                while not vehicle.is_armed:
+                    with suppress(CommandTimeout):  # `arm` is sent once, and may be lost.
+                        await vehicle.arm()
                 await vehicle.take_off(10.0)
                 assert vehicle.position.value.altitude_relative_m == pytest.approx(10.0, abs=1.5)
             return asyncio.get_running_loop().time(), radio.incoming.lost
