@@ -73,8 +73,8 @@ def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
     sensors = vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     if checks_pass and all(map(_is_about_estimates, against_arming)):
-        # The checks pass although estimates are missing, so the mode decides: for example, ArduCopter without a
-        # position arms in STABILIZE, but not in GUIDED.
+        # Whether missing estimates prevent arming depends on the mode. ArduCopter without a position arms in STABILIZE,
+        # but not in GUIDED.
         refusals = tuple(not_armable(vehicle, missing)) if reasons is None else ()
         all_reasons = dict.fromkeys([*missing, *against_arming])
         return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))
@@ -215,10 +215,7 @@ async def run_arming_checks(vehicle: Vehicle) -> None:
 
 
 def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
-    """Return the failing sensors of a disarmed vehicle.
-
-    The result is None if the vehicle is armed or silent, or if its arming checks pass.
-    """
+    """Return the failing sensors of a disarmed vehicle whose arming checks fail; None for any other vehicle."""
     sensors = vehicle.sensors.latest
     is_disarmed = vehicle.armed.latest is False
     if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:

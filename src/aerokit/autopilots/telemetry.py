@@ -15,7 +15,7 @@ PREARM_CHECK = Sensor.MAV_SYS_STATUS_PREARM_CHECK.value
 
 POS_HORIZ_ABS = Estimate.POS_HORIZ_ABS.value
 
-# Besides a position, arming requires these estimates in modes that need a position.
+# In modes that need a position, arming requires these estimates and the horizontal position.
 ATTITUDE_AND_HEIGHT = Estimate.ATTITUDE.value | Estimate.POS_VERT_ABS.value
 
 # MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR)

@@ -13,11 +13,11 @@ https://mavlink.io/en/guide/serialization.html
 from __future__ import annotations
 
 import re
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from itertools import chain
 from struct import Struct
 from struct import error as StructError  # noqa: N812
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.wire import wire
 from aerokit.mavlink.dialect import STANDARD, Dialect
@@ -27,8 +27,8 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# The last item has four bytes: the message id and the first byte of the payload. ``struct`` has no format for three
-# bytes.
+# The message id has three bytes, for which ``struct`` has no format. The last field therefore also contains the first
+# byte of the payload.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from
@@ -49,12 +49,19 @@ _NOISE = 5
 # Position of a valid frame, and parts of its header: (begin, end, message id, sequence number, source).
 _ValidFrame = tuple[int, int, int, int, int]
 
-# Findings about the data kept for the next call, which continues with them:
-# - the position up to which the data was examined;
-# - the possible frames: (begin, verdict, size of the data at which to examine the frame again);
-# - the positions of frames with a wrong checksum.
-_ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
-_NEW_SCAN: _ScanState = (0, [], [])
+# (begin, verdict, size of the data at which to examine the frame again)
+_Candidate = tuple[int, int, int]
+
+
+class _ScanState(NamedTuple):
+    """What `_search` knows about the data that it keeps. The next call continues there."""
+
+    examined_to: int = 0
+    candidates: Sequence[_Candidate] = ()
+    bad_crcs: Sequence[int] = ()  # positions of frames with a wrong checksum
+
+
+_NEW_SCAN = _ScanState()
 
 
 class PythonFramer:
@@ -74,7 +81,7 @@ class PythonFramer:
         self.foreign: list[Frame] = []
         """Frames of the last `receive` call that came from a second sender with the same ids."""
         self._rest = b""  # data kept for the next call, because a frame may begin in it
-        self._scan = _NEW_SCAN  # what `_search` has found in `_rest` so far
+        self._scan = _NEW_SCAN  # findings of `_search` about `_rest`
         self._unknown: list[bytes] = []  # frames of unknown messages, until `receive` returns them
         self._rows = dialect.rows
         self._extras = dialect.extras
@@ -208,7 +215,7 @@ class PythonFramer:
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
         """Add the frames that were out of order to :attr:`late` or :attr:`foreign`.
 
-        ``out_of_order`` has (position in ``frames``, `LATE` or `OTHERS`, sequence number and sender) for each of them.
+        Each item of ``out_of_order`` is (position in ``frames``, `LATE` or `OTHERS`, sequence number and sender).
         """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
@@ -228,14 +235,14 @@ class PythonFramer:
         size = len(data)
         keep_from = -1  # position from which data is kept
         unknown_begin = unknown_end = -1  # a possible frame of an unknown message; -1 if there is none
-        examined_to, candidates, bad_crcs = scan
-        pending: list[tuple[int, int, int]] = []
-        bad_crcs = list(bad_crcs)
+        examined_to = scan.examined_to
+        pending: list[_Candidate] = []
+        bad_crcs = list(scan.bad_crcs)
         # These verdicts are placeholders: a candidate with an end of 0 is examined at once.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)
-        for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):
+        for position, verdict, end in chain(scan.candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
                 # The unknown frame contains no valid frame. It is accepted if a frame or the end of the data follows.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
@@ -248,7 +255,7 @@ class PythonFramer:
                 unknown_begin = -1
             if position >= size:
                 break
-            # Examine the candidate if enough data has arrived. Further data does not change the verdict `_UNKNOWN`.
+            # Examine the candidate if enough data has arrived. A verdict of `_UNKNOWN` is final.
             if end <= size and verdict != _UNKNOWN:
                 verdict, end, frame = self._examine(data, position)
                 if verdict == _GOOD:
@@ -269,7 +276,7 @@ class PythonFramer:
         keep = size if keep_from < 0 else keep_from
         self._count_skipped(begin, keep, bad_crcs)
         self._rest = data[keep:]
-        self._scan = (
+        self._scan = _ScanState(
             examined_to - keep,
             [(position - keep, verdict, end - keep) for position, verdict, end in pending if position >= keep],
             [bad_crc - keep for bad_crc in bad_crcs if bad_crc >= keep],
@@ -294,7 +301,7 @@ class PythonFramer:
             source.skip(1)  # The frame was received, so its sequence number must not count as lost.
 
     def _count_skipped(self, begin: int, end: int, bad_crcs: list[int]) -> None:
-        # Bytes outside frames are counted. Bytes that are kept are not counted yet, because they may become a frame.
+        """Count the bytes from ``begin`` to ``end`` as bad. They are outside frames, and are not kept in ``_rest``."""
         self.statistics.bad_bytes += end - begin
         if bad_crcs:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
@@ -366,7 +373,7 @@ else:
             if kept == 2:
                 scan = self._scan
             elif kept == 1:
-                scan = (1, [(0, _WAIT, 0)], [])
+                scan = _ScanState(examined_to=1, candidates=[(0, _WAIT, 0)])
             next_frame = self._search(data, begin, scan)
             if self._unknown:
                 frames += self._take_unknown(now)

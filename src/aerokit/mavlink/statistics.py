@@ -16,7 +16,7 @@ _MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
 _MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
 _EXPIRY_S = 5.0  # A second stream and its alternations are forgotten after this time.
 _STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
-_MIN_RETURNS = 3  # A longer previous stream replaces the current one after this many further frames.
+_MIN_RETURNS = 3  # If the other stream has more frames, it replaces the current stream after this many of them.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHERS = range(3)
@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    Two senders with the same ids are detected, because their sequence numbers form two streams. Losses are then counted
-    only in the stream with more frames. When this stream has been silent for 1.5 s, the other one replaces it.
+    If two senders use the same ids, their sequence numbers form two streams. Lost frames are then counted in the stream
+    with more frames only. When that stream has been silent for 1.5 s, they are counted in the other stream.
     """
 
     expected: int
@@ -58,7 +58,7 @@ class SourceStatistics(SourceFields):
     _other_count: int  # number of frames of the second stream
     _other_at: float
     _skipped_over: int  # number of frames that count as lost between the two streams
-    _returns: int  # number of further frames of the previous stream
+    _returns: int  # number of frames received of the other stream while it has more frames than the current one
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id

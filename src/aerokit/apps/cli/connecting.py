@@ -174,10 +174,10 @@ def add_action(
 
 
 async def is_declined(options: argparse.Namespace, action: str, question: str, outcome: str) -> bool:
-    """Ask the user a question; return True if the answer is no.
+    """Ask the user for confirmation. Return True if the user declines, or if stdin is not a terminal.
 
-    With ``--yes``, the question is not asked. The answer is no if stdin is not a terminal. ``outcome`` ends the text
-    that is printed after a no, such as "sent" in "nothing was sent".
+    With ``--yes``, return False without asking. ``outcome`` is the last word of the text printed after a refusal:
+    "sent" in "nothing was sent".
     """
     if options.yes or (is_interactive() and await confirm(question)):
         return False

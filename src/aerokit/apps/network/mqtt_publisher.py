@@ -262,7 +262,7 @@ def _close_socket(client: Any) -> None:
 
 
 class _NullReceiver:
-    """Ignores everything. `ReconnectingLink` itself logs that the connection is lost or restored."""
+    """Ignores received data and lost connections. `ReconnectingLink` logs the latter."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         pass
