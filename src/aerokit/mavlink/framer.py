@@ -46,8 +46,24 @@ _UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
 
-# Position of a valid frame, and parts of its header: (begin, end, message id, sequence number, source).
-_ValidFrame = tuple[int, int, int, int, int]
+
+class _ValidFrame(NamedTuple):
+    """Position of a valid frame, and parts of its header."""
+
+    begin: int
+    end: int
+    message_id: int
+    sequence: int
+    source: int  # system id + 256 · component id
+
+
+class _OutOfOrder(NamedTuple):
+    """A frame whose sequence number was not the expected one."""
+
+    position: int  # in the list of returned frames, if the message is wanted
+    ordering: int  # LATE or OTHERS
+    identity: int  # sequence number << 16 | component id << 8 | system id
+
 
 # (begin, verdict, size of the data at which to examine the frame again)
 _Candidate = tuple[int, int, int]
@@ -133,7 +149,7 @@ class PythonFramer:
             size = len(data)
         extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
-        out_of_order: list[tuple[int, int, int]] | None = None
+        out_of_order: list[_OutOfOrder] | None = None
         begin = end = flags = checksum = 0
         body = b""
         while begin < size:
@@ -175,7 +191,7 @@ class PythonFramer:
             else:
                 out_of_order = out_of_order or []
                 if ordering := source.out_of_order(sequence, now):
-                    out_of_order.append((len(frames), ordering, sequence << 16 | key))
+                    out_of_order.append(_OutOfOrder(len(frames), ordering, sequence << 16 | key))
             if wanted is None or message_id in wanted:
                 if is_valid:
                     frame = Frame()
@@ -212,11 +228,8 @@ class PythonFramer:
         """Number of bytes kept because they may become a frame; at most a few hundred."""
         return len(self._rest)
 
-    def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
-        """Add the frames that were out of order to :attr:`late` or :attr:`foreign`.
-
-        Each item of ``out_of_order`` is (position in ``frames``, `LATE` or `OTHERS`, sequence number and sender).
-        """
+    def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[_OutOfOrder]) -> None:
+        """Add the frames that were out of order to :attr:`late` or :attr:`foreign`."""
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
@@ -307,9 +320,9 @@ class PythonFramer:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
-        """Examine a possible frame at ``begin``. Return the verdict, the position of its end, and the valid frame.
+        """Examine a possible frame at ``begin``. Return (verdict, end, valid frame or None).
 
-        If the header is incomplete, the second value is the end of the header.
+        The end is that of the frame or, if the header is incomplete, of the header.
         """
         size = len(data)
         if data[begin] == MAGIC_V2:
@@ -343,7 +356,7 @@ class PythonFramer:
         (checksum,) = _CHECKSUM(data, payload_end)
         if x25(data[begin + 1 : payload_end] + bytes((extra,))) != checksum:
             return _BAD_CRC, end, None
-        return _GOOD, end, (begin, end, message_id, sequence, key)
+        return _GOOD, end, _ValidFrame(begin, end, message_id, sequence, source=key)
 
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
@@ -363,7 +376,7 @@ else:
         def __init__(self, dialect: Dialect = STANDARD, limit: SourceLimit | None = None) -> None:
             PythonFramer.__init__(self, dialect, limit)
             self._table = dialect.table
-            self._out_of_order: list[tuple[int, int, int]] = []
+            self._out_of_order: list[_OutOfOrder] = []
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
             """Return the start of the next valid frame from ``begin`` on, or None. Add unknown frames to ``frames``."""
@@ -377,17 +390,14 @@ else:
             next_frame = self._search(data, begin, scan)
             if self._unknown:
                 frames += self._take_unknown(now)
-            if next_frame is None:
-                return None
-            frame_begin, *_ = next_frame
-            return frame_begin
+            return None if next_frame is None else next_frame.begin
 
         def _add_source(self, key: int, sequence: int, now: float) -> SourceStatistics:
             return self.statistics.add_source(key, sequence, self._limit.make_room(now))
 
         def _count_out_of_order(self, source: SourceStatistics, key: int, sequence: int, now: float, at: int) -> None:
             if ordering := source.out_of_order(sequence, now):
-                self._out_of_order.append((at, ordering, sequence << 16 | key))
+                self._out_of_order.append(_OutOfOrder(at, ordering, sequence << 16 | key))
 
         def _sort_out_of_order(self, frames: list[Frame]) -> None:
             out_of_order, self._out_of_order = self._out_of_order, []

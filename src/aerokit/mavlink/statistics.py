@@ -54,9 +54,10 @@ class SourceStatistics(SourceFields):
     )
 
     _late_run: int  # length of the current run of repeated frames with consecutive sequence numbers
-    # The following are set when a second stream with the same ids begins.
-    _other_count: int  # number of frames of the second stream
-    _other_at: float
+    # Two senders with the same ids form two streams: the current one and the other one. These attributes are set when
+    # a second stream begins.
+    _other_count: int  # number of frames of the other stream
+    _other_at: float  # time of its last frame
     _skipped_over: int  # number of frames that count as lost between the two streams
     _returns: int  # number of frames received of the other stream while it has more frames than the current one
 
@@ -74,7 +75,7 @@ class SourceStatistics(SourceFields):
         self._missing_base = sequence
         self._repeated_sequence = -1  # sequence number of the last repeated frame
         self._received_at_repetition = -1  # value of `received` when that frame arrived
-        self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
+        self._other_expected = -1  # next sequence number of the other stream; -1 if there is only one stream
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations = 0  # how often the two streams have alternated
         self._alternated_at = 0.0  # time of the last alternation
@@ -171,8 +172,7 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # If the repeated frames are in sequence, a second sender may have sent them. Its frames alternate with the
-        # first sender's.
+        # Repeated frames in sequence may come from a second sender, whose frames alternate with those of the first.
         if follows:
             self._count_alternation(now)
         else:

@@ -212,8 +212,8 @@ def command_action(
 async def connected(options: argparse.Namespace, *, changes: bool = False) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle that the options name, without requesting message rates.
 
-    Commands that change something on the vehicle set ``changes``. The user must then choose a vehicle with
-    ``--system-id`` if several are on the link.
+    ``changes`` means that the command changes something on the vehicle. If several vehicles are on the link, the user
+    must then choose one with ``--system-id``.
     """
     async with connect_to(
         options,

@@ -386,7 +386,7 @@ class FlightReport:
         self._armed_at = self._vehicle.connection.now() if is_armed else None
 
     def _add_armed_time(self) -> None:
-        """Add the time since arming, if the vehicle is armed, to the seconds armed."""
+        """Add the time since arming to the seconds armed. Does nothing if the vehicle is disarmed."""
         if self._armed_at is not None:
             self._armed_s += self._vehicle.connection.now() - self._armed_at
             self._armed_at = None

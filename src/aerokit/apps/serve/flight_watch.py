@@ -199,8 +199,7 @@ class FlightWatch:
         if self._crash is not None:
             self._moving_since = math.inf if is_still else min(self._moving_since, at)
             is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
-            # A slow vehicle counts as flying only after it has moved for CRASH_STILL_S, the time it had to lie still
-            # before it counted as crashed.
+            # A slow movement must last as long as the vehicle had to lie still before it counted as crashed.
             is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
             if self._vehicle.armed.latest and (is_moving or self._has_climbed):
                 self._dismiss_impact()  # the vehicle flies again
