@@ -16,7 +16,7 @@ _MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
 _MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
 _EXPIRY_S = 5.0  # A second stream and its alternations are forgotten after this time.
 _STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
-_MIN_RETURNS = 3  # If the other stream has more frames, it replaces the current stream after this many of them.
+_MIN_RETURNS = 3  # If the other stream is longer, it becomes the current one after this many further frames.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHERS = range(3)
@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    If two senders use the same ids, their sequence numbers form two streams. Lost frames are then counted in the stream
-    with more frames only. When that stream has been silent for 1.5 s, they are counted in the other stream.
+    If two senders use the same ids, their sequence numbers form two streams. Lost frames are then counted only in the
+    stream with more frames. When that stream has been silent for 1.5 s, they are counted only in the other stream.
     """
 
     expected: int

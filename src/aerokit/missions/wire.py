@@ -215,9 +215,9 @@ def pack_items(
     By default, the plan replaces all items. When the written file is closed, ArduPilot deletes the old items and stores
     the new items, up to the first item that it refuses.
 
-    With the option :data:`NO_CLEAR`, for missions only, the items replace those from index ``first`` on or are
-    appended. ArduPilot keeps all other items. Jump targets must be below the number of items in the file
-    (ArduPilot 4.7).
+    With the option :data:`NO_CLEAR`, which is for missions only, the plan replaces items from index ``first`` on, or
+    appends items at the end of the mission. ArduPilot keeps all other items. Jump targets must be below the number of
+    items in the file (ArduPilot 4.7).
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

@@ -146,7 +146,8 @@ class FlightWatch:
     def _on_armed(self, before: bool | None, is_armed: bool) -> None:
         now = self._now()
         if is_armed:
-            self._armed_at = now if before is False else None  # The vehicle may be armed when this object is created.
+            # If no report of a disarmed vehicle came before, the vehicle may have been armed long ago.
+            self._armed_at = now if before is False else None
             self._was_in_air = self._vehicle.landed_state.latest in _IN_AIR
             self._disarming = None
             self._reset()
