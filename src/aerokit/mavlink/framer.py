@@ -70,7 +70,7 @@ _Candidate = tuple[int, int, int]
 
 
 class _ScanState(NamedTuple):
-    """What `_search` knows about the data that it keeps. The next call continues there."""
+    """Findings of `_search` about the data that it keeps. The next call continues with them."""
 
     examined_to: int = 0
     candidates: Sequence[_Candidate] = ()
