@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 _OWN_FLIGHT_PURPOSES: tuple[Literal["setpoint", "mission", "return"], ...] = ("setpoint", "mission", "return")
-# The texts of one failsafe arrive within this many seconds. PX4 holds for COM_FAIL_ACT_T before some actions.
+# The texts of one failsafe may be this many seconds apart, because PX4 holds for COM_FAIL_ACT_T before some actions.
 _FAILSAFE_REPORT_DURATION_S = 10.0
 
 
@@ -73,8 +73,8 @@ def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
     sensors = vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     if checks_pass and all(map(_is_about_estimates, against_arming)):
-        # The checks pass although estimates are missing, so the mode decides: for example, ArduCopter without a
-        # position arms in STABILIZE, but not in GUIDED.
+        # Whether missing estimates prevent arming depends on the mode. ArduCopter without a position arms in STABILIZE,
+        # but not in GUIDED.
         refusals = tuple(not_armable(vehicle, missing)) if reasons is None else ()
         all_reasons = dict.fromkeys([*missing, *against_arming])
         return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))
@@ -118,9 +118,8 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     if sensors is not None and sensors.prearm_checks_pass is False:
         return _needed_to_arm(vehicle, missing)
     mode = vehicle.mode.latest
-    arms_in = None if mode is None else mode.name
-    if unarmable is not None:
-        arms_in = unarmable["arms_in"]
+    current_mode = None if mode is None else mode.name
+    arms_in = current_mode if unarmable is None else unarmable["arms_in"]
     # In modes that need no position, ArduPilot arms without most of these conditions.
     if arms_in is None or not autopilot.modes_without_position or arms_in in autopilot.modes_without_position:
         return []
@@ -215,10 +214,7 @@ async def run_arming_checks(vehicle: Vehicle) -> None:
 
 
 def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
-    """Return the failing sensors of a disarmed vehicle.
-
-    The result is None if the vehicle is armed or silent, or if its arming checks pass.
-    """
+    """Return the failing sensors if the vehicle is connected and disarmed, and its arming checks fail; else None."""
     sensors = vehicle.sensors.latest
     is_disarmed = vehicle.armed.latest is False
     if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:

@@ -82,13 +82,13 @@ class TakeOff(Snapshot):
 
 
 class SetpointRules(Snapshot):
-    """Set-points that the autopilot supports, and how it treats a stream of set-points.
+    """Kinds of set-points that an autopilot supports, and how it handles a stream of set-points.
 
     - ``stream_before_mode``: the stream must be running before the mode is requested.
-    - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is a turn, not a heading.
-    - ``position_restarts_path``: each position set-point, even a repeated set-point, restarts the path from a
-      standstill.
-    - ``trajectory``: set-points of positions with velocity and acceleration are supported.
+    - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the current heading.
+    - ``position_restarts_path``: each position set-point restarts the path from a standstill, even if the position is
+      unchanged.
+    - ``trajectory``: set-points with position, velocity and acceleration are supported.
     """
 
     local_position: bool = True
@@ -372,7 +372,7 @@ class Autopilot:
         return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name to store for a mode in AVAILABLE_MODES; None if the name is empty or the mode is known."""
+        """Return the name to store for a mode of AVAILABLE_MODES; None if the name is empty or the mode is known."""
         return name if name and custom_mode not in self.modes.numbers else None
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
@@ -387,9 +387,9 @@ class Autopilot:
         return None
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:
-        """Return the possible names of the parameter for the altitude of a return, newest first.
+        """Return the names of the return altitude parameter in all firmware versions, newest first.
 
-        Each name comes with its units per metre. The result is empty if there is no such parameter.
+        Each item is (name, units of the parameter per metre). The result is empty if there is no such parameter.
         """
         return ()
 

@@ -26,17 +26,14 @@ ExternalKind: TypeAlias = Literal[
 
 
 class ExternalRule(Snapshot):
-    """Parameter values with which the autopilot uses one kind of measurement.
-
-    - ``required``: parameters, each with its names in several firmware versions and its suitable values. The autopilot
-      uses the measurements only if every parameter has a suitable value.
-    - ``sole_source``: parameters, each with its suitable values. If every parameter has a suitable value, the
-      measurement is the estimator's only source of position or velocity. The vehicle must have the first parameter;
-      others that it does not have are ignored.
-    """
+    """Parameter values with which the autopilot uses one kind of measurement."""
 
     required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()
+    """(names, allowed values) of each parameter on which the use of the measurement depends. The names are those of
+    one parameter in several firmware versions."""
     sole_source: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    """(name, values) of parameters. If they all have one of their values, the estimator's only source of position or
+    velocity is this measurement. The vehicle must have the first parameter; it may lack the others."""
 
 
 class ExternalRules(Snapshot):

@@ -120,7 +120,8 @@ class Px4(Autopilot):
     reposition_purpose: Purpose = "hold"
     holds_after_mission = True
     mission_end_text: str | None = "Mission finished"  # mission_base.cpp
-    # mission_base.cpp, update_mission. A finished mission is not flown again before an item is selected.
+    # PX4 also sends this text if a finished mission is started again, unless an item was selected (mission_base.cpp,
+    # update_mission).
     no_mission_text: str | None = "No valid mission available"
     prearm_depends_on_mode = True
     # PX4 answers by a status text for each failing check (Commander.cpp; measured with 1.17 in simulation).
@@ -181,7 +182,7 @@ class Px4(Autopilot):
             self.arrival_radius_m: float = 120.0
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode with these numbers. The registered name of an external mode replaces EXTERNAL1 etc."""
+        """Return the mode with these numbers. An external mode has its registered name, if that is known."""
         if custom_mode in _EXTERNAL_MODES and custom_mode in extra:
             return Mode(extra[custom_mode], custom_mode, base_mode)
         return super().mode(custom_mode, base_mode, extra)

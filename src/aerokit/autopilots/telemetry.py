@@ -15,7 +15,7 @@ PREARM_CHECK = Sensor.MAV_SYS_STATUS_PREARM_CHECK.value
 
 POS_HORIZ_ABS = Estimate.POS_HORIZ_ABS.value
 
-# Besides a position, arming requires these estimates in modes that need a position.
+# In modes that need a position, arming requires these estimates and the horizontal position.
 ATTITUDE_AND_HEIGHT = Estimate.ATTITUDE.value | Estimate.POS_VERT_ABS.value
 
 # MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR)
@@ -143,9 +143,9 @@ _VERSION_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "
 class AutopilotVersion(Snapshot):
     """Firmware and hardware of an autopilot (AUTOPILOT_VERSION).
 
-    ``firmware`` is for example ``"4.7.0-dev"``, ``number`` its (major, minor, patch), ``git_hash`` the beginning of the
-    commit hash or an empty string. ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits. ``uid`` identifies the hardware,
-    0 if not reported.
+    ``firmware`` is for example ``"4.7.0-dev"``, and ``number`` is (major, minor, patch). ``git_hash`` is the beginning
+    of the commit hash, or empty. ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits. ``uid`` identifies the hardware; it
+    is 0 if not reported.
     """
 
     firmware: str

@@ -13,11 +13,11 @@ https://mavlink.io/en/guide/serialization.html
 from __future__ import annotations
 
 import re
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from itertools import chain
 from struct import Struct
 from struct import error as StructError  # noqa: N812
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.wire import wire
 from aerokit.mavlink.dialect import STANDARD, Dialect
@@ -27,8 +27,8 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# The last item has four bytes: the message id and the first byte of the payload. ``struct`` has no format for three
-# bytes.
+# The message id has three bytes, for which ``struct`` has no format. The last field therefore also contains the first
+# byte of the payload.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from
@@ -46,15 +46,38 @@ _UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
 
-# Position of a valid frame, and parts of its header: (begin, end, message id, sequence number, source).
-_ValidFrame = tuple[int, int, int, int, int]
 
-# State of a scan, from which the next call continues:
-# - the position up to which the data was examined;
-# - the possible frames: (begin, verdict, number of bytes that must have arrived before it is examined again);
-# - the positions of frames with a wrong checksum.
-_ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
-_NEW_SCAN: _ScanState = (0, [], [])
+class _ValidFrame(NamedTuple):
+    """Position of a valid frame, and parts of its header."""
+
+    begin: int
+    end: int
+    message_id: int
+    sequence: int
+    source: int  # system id + 256 · component id
+
+
+class _OutOfOrder(NamedTuple):
+    """A frame whose sequence number was not the expected one."""
+
+    position: int  # in the list of returned frames, if the message is wanted
+    ordering: int  # LATE or OTHERS
+    identity: int  # sequence number << 16 | component id << 8 | system id
+
+
+# A possible frame: (begin, verdict, number of bytes that must have arrived before it is examined again).
+_Candidate = tuple[int, int, int]
+
+
+class _ScanState(NamedTuple):
+    """State of `_search`, from which its next call continues."""
+
+    examined_to: int = 0
+    candidates: Sequence[_Candidate] = ()
+    bad_crcs: Sequence[int] = ()  # positions of frames with a wrong checksum
+
+
+_NEW_SCAN = _ScanState()
 
 
 class PythonFramer:
@@ -74,7 +97,7 @@ class PythonFramer:
         self.foreign: list[Frame] = []
         """Frames of the last `receive` call that came from a second sender with the same ids."""
         self._rest = b""  # data kept for the next call, because a frame may begin in it
-        self._scan = _NEW_SCAN  # what `_search` has found in `_rest` so far
+        self._scan = _NEW_SCAN  # findings of `_search` about `_rest`
         self._unknown: list[bytes] = []  # frames of unknown messages, until `receive` returns them
         self._rows = dialect.rows
         self._extras = dialect.extras
@@ -126,7 +149,7 @@ class PythonFramer:
             size = len(data)
         extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
-        out_of_order: list[tuple[int, int, int]] | None = None
+        out_of_order: list[_OutOfOrder] | None = None
         begin = end = flags = checksum = 0
         body = b""
         while begin < size:
@@ -168,7 +191,7 @@ class PythonFramer:
             else:
                 out_of_order = out_of_order or []
                 if ordering := source.out_of_order(sequence, now):
-                    out_of_order.append((len(frames), ordering, sequence << 16 | key))
+                    out_of_order.append(_OutOfOrder(len(frames), ordering, sequence << 16 | key))
             if wanted is None or message_id in wanted:
                 if is_valid:
                     frame = Frame()
@@ -205,11 +228,8 @@ class PythonFramer:
         """Number of bytes kept because they may become a frame; at most a few hundred."""
         return len(self._rest)
 
-    def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
-        """Add the frames that were out of order to :attr:`late` or :attr:`foreign`.
-
-        ``out_of_order`` has (position in ``frames``, `LATE` or `OTHERS`, sequence number and sender) for each of them.
-        """
+    def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[_OutOfOrder]) -> None:
+        """Add the frames that were out of order to :attr:`late` or :attr:`foreign`."""
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
@@ -228,14 +248,14 @@ class PythonFramer:
         size = len(data)
         keep_from = -1  # position from which data is kept
         unknown_begin = unknown_end = -1  # a possible frame of an unknown message; -1 if there is none
-        examined_to, candidates, bad_crcs = scan
-        pending: list[tuple[int, int, int]] = []
-        bad_crcs = list(bad_crcs)
+        examined_to = scan.examined_to
+        pending: list[_Candidate] = []
+        bad_crcs = list(scan.bad_crcs)
         # These verdicts are placeholders: a candidate with an end of 0 is examined at once.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)
-        for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):
+        for position, verdict, end in chain(scan.candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
                 # The unknown frame contains no valid frame. It is accepted if a frame or the end of the data follows.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
@@ -248,7 +268,7 @@ class PythonFramer:
                 unknown_begin = -1
             if position >= size:
                 break
-            # Examine the candidate if enough data has arrived. Further data does not change the verdict `_UNKNOWN`.
+            # Examine the candidate if enough data has arrived. A verdict of `_UNKNOWN` is final.
             if end <= size and verdict != _UNKNOWN:
                 verdict, end, frame = self._examine(data, position)
                 if verdict == _GOOD:
@@ -269,7 +289,7 @@ class PythonFramer:
         keep = size if keep_from < 0 else keep_from
         self._count_skipped(begin, keep, bad_crcs)
         self._rest = data[keep:]
-        self._scan = (
+        self._scan = _ScanState(
             examined_to - keep,
             [(position - keep, verdict, end - keep) for position, verdict, end in pending if position >= keep],
             [bad_crc - keep for bad_crc in bad_crcs if bad_crc >= keep],
@@ -294,15 +314,15 @@ class PythonFramer:
             source.skip(1)  # The frame was received, so its sequence number must not count as lost.
 
     def _count_skipped(self, begin: int, end: int, bad_crcs: list[int]) -> None:
-        # Bytes outside frames are counted. Bytes that are kept are not counted yet, because they may become a frame.
+        """Count the bytes from ``begin`` to ``end`` as bad. They are outside frames, and are not kept in ``_rest``."""
         self.statistics.bad_bytes += end - begin
         if bad_crcs:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
-        """Examine a possible frame at ``begin``. Return the verdict, the position of its end, and the valid frame.
+        """Examine a possible frame at ``begin``. Return (verdict, end, valid frame or None).
 
-        If the header is incomplete, the second value is the end of the header.
+        The end is that of the frame or, if the header is incomplete, of the header.
         """
         size = len(data)
         if data[begin] == MAGIC_V2:
@@ -336,7 +356,7 @@ class PythonFramer:
         (checksum,) = _CHECKSUM(data, payload_end)
         if x25(data[begin + 1 : payload_end] + bytes((extra,))) != checksum:
             return _BAD_CRC, end, None
-        return _GOOD, end, (begin, end, message_id, sequence, key)
+        return _GOOD, end, _ValidFrame(begin, end, message_id, sequence, source=key)
 
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
@@ -356,7 +376,7 @@ else:
         def __init__(self, dialect: Dialect = STANDARD, limit: SourceLimit | None = None) -> None:
             PythonFramer.__init__(self, dialect, limit)
             self._table = dialect.table
-            self._out_of_order: list[tuple[int, int, int]] = []
+            self._out_of_order: list[_OutOfOrder] = []
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
             """Return the start of the next valid frame from ``begin`` on, or None. Add unknown frames to ``frames``."""
@@ -366,21 +386,18 @@ else:
             if kept == 2:
                 scan = self._scan
             elif kept == 1:
-                scan = (1, [(0, _WAIT, 0)], [])
+                scan = _ScanState(examined_to=1, candidates=[(0, _WAIT, 0)])
             next_frame = self._search(data, begin, scan)
             if self._unknown:
                 frames += self._take_unknown(now)
-            if next_frame is None:
-                return None
-            frame_begin, *_ = next_frame
-            return frame_begin
+            return None if next_frame is None else next_frame.begin
 
         def _add_source(self, key: int, sequence: int, now: float) -> SourceStatistics:
             return self.statistics.add_source(key, sequence, self._limit.make_room(now))
 
         def _count_out_of_order(self, source: SourceStatistics, key: int, sequence: int, now: float, at: int) -> None:
             if ordering := source.out_of_order(sequence, now):
-                self._out_of_order.append((at, ordering, sequence << 16 | key))
+                self._out_of_order.append(_OutOfOrder(at, ordering, sequence << 16 | key))
 
         def _sort_out_of_order(self, frames: list[Frame]) -> None:
             out_of_order, self._out_of_order = self._out_of_order, []

@@ -170,7 +170,7 @@ def _wire_fields(message_type: type[Message]) -> list[Field]:
 
 def layout_of(message_type: type[Message]) -> Any:
     """Return the description of the fields for compiled code; None if compiled code cannot be used for this class."""
-    own_attributes = message_type.__dict__  # without the attributes of base classes, whose layout would be wrong
+    own_attributes = message_type.__dict__  # A layout inherited from a base class would be wrong.
     if "_LAYOUT" not in own_attributes:
         is_generated = {"_FIELDS", "decode_body", "encode"} <= own_attributes.keys()
         message_type._LAYOUT = _new_layout(message_type) if wire is not None and is_generated else None

@@ -30,8 +30,8 @@ class MessageFactory(_MAVLink):
     The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2, and further messages of the program's
     dialect (``mavutil.mavlink``). Strings may be ``str`` or bytes. Values are only checked on sending.
 
-    This factory sends with aerokit: ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message,
-    vehicle.system_id)), 255, 0)``. The conversion also rounds numbers for integer fields.
+    To send with aerokit, create the factory with ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message,
+    vehicle.system_id)), 255, 0)``. `from_pymavlink` also rounds numbers for integer fields.
     """
 
     seq: int

@@ -59,7 +59,7 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
 
 def _class_of(message: Any) -> type[Message]:
     message_type: Any = type(message)
-    # Classes of pymavlink have these attributes. For any other object, the message's name must be in the standard.
+    # Classes of pymavlink have these attributes. Other objects are looked up by their message name.
     if hasattr(message_type, "ordered_fieldnames") and hasattr(message_type, "crc_extra"):
         return _counterpart(int(message_type.id), int(message_type.crc_extra), message_type)
     try:
@@ -141,8 +141,8 @@ def _integer(value: Any) -> Any:
 
 
 def _real(value: Any) -> Any:
-    # Numbers of numpy and decimal have __float__, too. Other values are returned unchanged, because `Message.encode`
-    # rejects them.
+    # Numbers of numpy and decimal have __float__, too. Values that are not numbers are returned unchanged;
+    # `Message.encode` rejects them.
     if isinstance(value, (int, float)) or not hasattr(value, "__float__"):
         return value
     try:
@@ -210,8 +210,8 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
     Args:
         frame: a received frame: ``message.received_frame``, or the argument of a frame observer.
-        dialect: pymavlink module for MAVLink 2, which is tried before pymavlink's ardupilotmega and development. The
-            first module that has the message decodes it. Modules with another CRC_EXTRA than the standard are skipped.
+        dialect: pymavlink module for MAVLink 2 that decodes the message. If it lacks the message, or has another
+            CRC_EXTRA than the standard, pymavlink's modules ardupilotmega and development are tried.
         timestamp: ``_timestamp`` of the message: in pymavlink, seconds since 1970.
 
     Returns:

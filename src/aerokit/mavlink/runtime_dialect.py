@@ -33,7 +33,7 @@ LoadedDialect = tuple[str, list[type[Message]], dict[str, type[Any]]]
 
 
 class Standard(Protocol):
-    """Interface of the dialect of generated messages. Other dialects reuse its classes for the same messages."""
+    """Dialect of the generated message classes. Loaded dialects use these classes for messages with the same format."""
 
     rows: dict[int, tuple[int, int, int]]
 
@@ -61,7 +61,7 @@ def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Load
 
 
 def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message]:
-    """Return the aerokit class for a message class of pymavlink. A class is created if there is none of this format.
+    """Return the aerokit class with the format of a pymavlink message class. If there is none, create it.
 
     Raises:
         InvalidArgument: the fields of pymavlink's class do not match its CRC_EXTRA.

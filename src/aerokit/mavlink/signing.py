@@ -34,7 +34,7 @@ ONE_MINUTE = 60 * TICKS_PER_S
 # create one.
 MAX_STREAMS = 1024
 
-# Telemetry radios insert RADIO_STATUS (109) and RADIO (166), and have no key.
+# RADIO_STATUS (109) and RADIO (166) come from telemetry radios, which have no key.
 ALWAYS_UNSIGNED = frozenset((109, 166))
 
 _HASH_LENGTH = 6
@@ -129,8 +129,8 @@ class Refusal(Enum):
 class Signing:
     """Signs the sent frames of one link, verifies the received frames, and counts refused frames.
 
-    Each link needs a separate object, because the object stores timestamps. For further links with the same key, create
-    the objects with :meth:`for_link`. An object can be reused after its link is closed.
+    Use a separate object for each link. For further links with the same key, create the objects with :meth:`for_link`.
+    An object can be reused after its link is closed.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class Signing:
     def check(self, frame: Frame, now: float = 0.0) -> Refusal | None:
         """Like :meth:`accepts`, but return the reason for refusing a frame; None if it is accepted.
 
-        ``now`` is in seconds since 1970; 0 without a clock.
+        ``now`` is the time in seconds since 1970; 0 if it is unknown.
         """
         refusal = self._check_signature(frame, now)
         if refusal is None or self.may_be_unsigned(frame):
@@ -271,7 +271,7 @@ class Signing:
         return None
 
     def _store_timestamp(self, stream: tuple[int, int, int], timestamp: int) -> None:
-        # The next frame of a removed stream is checked like that of a new sender: only against our own timestamp.
+        # Remove the stream with the oldest timestamp. Its next frame counts as the first frame of a new sender.
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
             del self.streams[min(self.streams, key=self.streams.__getitem__)]
         self.streams[stream] = timestamp
@@ -306,8 +306,8 @@ _MAX_LENGTH = 64
 class TimestampFile:
     """A file with a timestamp that is later than all timestamps used so far.
 
-    The constructor raises OSError, or FileFormatError if the file does not contain a timestamp. Later errors must not
-    end a flight, so :meth:`reserve` stores them in ``error``.
+    The constructor raises OSError, or FileFormatError if the file does not contain a timestamp. :meth:`reserve` stores
+    errors in ``error`` instead of raising them, because it is called in flight.
     """
 
     def __init__(self, path: str | PathLike[str], maximum: int) -> None:
@@ -319,7 +319,7 @@ class TimestampFile:
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the stored timestamp is later than ``timestamp``. If not, write ``timestamp + ahead``."""
+        """Write ``timestamp + ahead``, unless the last write was of a timestamp later than ``timestamp``."""
         if timestamp < self.timestamp:
             return
         # Set before writing, so that a failed write is not retried with every frame. Writing may block the event loop.
@@ -327,7 +327,7 @@ class TimestampFile:
         try:
             self._write(self.timestamp)
             self.error = None
-        except OSError as error:  # Signing continues without the file; the owner reports the error.
+        except OSError as error:  # Signing continues without the file. `Signing.keep_error` reports the error.
             self.error = error
 
     def _write(self, timestamp: int) -> None:

@@ -16,7 +16,7 @@ _MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
 _MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
 _EXPIRY_S = 5.0  # A second stream and its alternations are forgotten after this time.
 _STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
-_MIN_RETURNS = 3  # A longer previous stream replaces the current one after this many further frames.
+_MIN_RETURNS = 3  # If the other stream is longer, it becomes the current one after this many further frames.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHERS = range(3)
@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    Two senders with the same ids are detected, because their sequence numbers form two streams. Losses are then counted
-    only in the stream with more frames. When this stream has been silent for 1.5 s, the other one replaces it.
+    If two senders use the same ids, their sequence numbers form two streams. Lost frames are then counted only in the
+    stream with more frames. When that stream has been silent for 1.5 s, they are counted only in the other stream.
     """
 
     expected: int
@@ -54,11 +54,12 @@ class SourceStatistics(SourceFields):
     )
 
     _late_run: int  # length of the current run of repeated frames with consecutive sequence numbers
-    # The following are set when a second stream with the same ids begins.
-    _other_count: int  # number of frames of the second stream
-    _other_at: float
+    # Two senders with the same ids form two streams: the current one and the other one. These attributes are set when
+    # a second stream begins.
+    _other_count: int  # number of frames of the other stream
+    _other_at: float  # time of its last frame
     _skipped_over: int  # number of frames that count as lost between the two streams
-    _returns: int  # number of further frames of the previous stream
+    _returns: int  # number of frames received of the other stream while it has more frames than the current one
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id
@@ -74,7 +75,7 @@ class SourceStatistics(SourceFields):
         self._missing_base = sequence
         self._repeated_sequence = -1  # sequence number of the last repeated frame
         self._received_at_repetition = -1  # value of `received` when that frame arrived
-        self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
+        self._other_expected = -1  # next sequence number of the other stream; -1 if there is only one stream
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations = 0  # how often the two streams have alternated
         self._alternated_at = 0.0  # time of the last alternation
@@ -171,8 +172,7 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # If the repeated frames are in sequence, a second sender may have sent them. Its frames alternate with the
-        # first sender's.
+        # Repeated frames in sequence may come from a second sender, whose frames alternate with those of the first.
         if follows:
             self._count_alternation(now)
         else:

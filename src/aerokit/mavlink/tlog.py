@@ -49,7 +49,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     begin: int = 0  # position of the next record in `data`
     end: int | None
     is_at_end = False  # True if the whole file has been read
-    min_time = 0  # A record with an earlier time is garbage; see _FIRST_TIME.
+    min_time = 0  # minimum time of the next record: 0 or _FIRST_TIME
     while True:
         # `data` must contain a whole record and the header of the next one, so that the record can be verified.
         if not is_at_end and len(data) - begin < 2 * _MAX_RECORD:

@@ -281,7 +281,7 @@ def region_of_interest(
     altitude_amsl_m: float | None = None,
     altitude_terrain_m: float | None = None,
 ) -> MissionItem:
-    """Point the gimbal or the nose at a place from here on. Needs exactly one altitude.
+    """Point the gimbal or the nose at a place until :func:`region_of_interest_none`. Needs exactly one altitude.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION
     """

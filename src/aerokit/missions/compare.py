@@ -37,7 +37,7 @@ FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
 class ItemStorage(Enum):
-    """How items that were read back had been stored. Comparisons tolerate the changes that this causes."""
+    """Where items were stored before they were read back. Comparisons ignore the changes that this storage makes."""
 
     WIRE = "wire"
     """Only changes made by MISSION_ITEM_INT: rounding to 32-bit floats, and equivalent frames."""
@@ -233,9 +233,9 @@ def plan_differences(
 def changed_items(
     expected: Sequence[MissionItem], actual: Sequence[MissionItem], storage: ItemStorage = ItemStorage.WIRE
 ) -> tuple[int, ...]:
-    """Return the indices of expected items that ``actual`` lacks or has changed.
+    """Return the indices of the expected items that are missing or different in ``actual``.
 
-    Further items at the end of ``actual`` are not reported. Changes that ``storage`` explains are tolerated.
+    Further items at the end of ``actual`` are not reported. Differences that ``storage`` causes are ignored.
     """
     common = min(len(expected), len(actual))
     changed = [i for i in range(common) if item_differences(expected[i], actual[i], storage)]

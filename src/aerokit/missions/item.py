@@ -256,7 +256,7 @@ def place_item(
     *parameters: float,
     is_needed: bool = False,
 ) -> MissionItem:
-    """Create an item at a place, or at 0°, 0° without a place, which ArduPilot takes for the current position.
+    """Create an item at a place. Without a place, x and y are 0, which ArduPilot takes for the current position.
 
     Exactly one of the three ``altitudes`` must be given (above home, above mean sea level, above the terrain), unless
     the place is a Position with an altitude. With ``is_needed``, a missing place raises InvalidArgument.

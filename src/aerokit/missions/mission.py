@@ -107,7 +107,7 @@ _CIRCLE = {True: MavCmd.NAV_FENCE_CIRCLE_INCLUSION, False: MavCmd.NAV_FENCE_CIRC
 
 
 class FencePolygon(Snapshot):
-    """A polygon of at least three vertices that the vehicle must stay inside, or outside if not ``inclusion``.
+    """A polygon of at least three vertices. The vehicle must stay inside or, if ``inclusion`` is False, outside.
 
     ``vertices`` is converted to a tuple; altitudes are ignored. ArduPilot stores at most 255 vertices.
     """
@@ -125,7 +125,7 @@ class FencePolygon(Snapshot):
 
 
 class FenceCircle(Snapshot):
-    """A circle that the vehicle must stay inside, or outside if not ``inclusion``."""
+    """A circle. The vehicle must stay inside or, if ``inclusion`` is False, outside."""
 
     center: Position
     radius_m: float

@@ -82,7 +82,7 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
 def format_plan(plan: Plan | Mission) -> str:
     """Format a plan or a mission as the text of a .plan file.
 
-    If the plan was read from a file, all values of that file that have not changed are kept, also unknown fields.
+    If the plan was read from a .plan file, the unchanged values of that file are kept, including unknown fields.
 
     Raises:
         InvalidArgument: ``plan`` is neither a plan nor a mission, or it has a value that a .plan file cannot store: an

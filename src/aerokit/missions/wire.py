@@ -162,7 +162,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
         latitude_deg, longitude_deg = here
         current_xy = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
     for item in items:
-        # For a command that has no position, ArduPilot accepts any frame, PX4 only MAV_FRAME_MISSION.
+        # If a command has no position, PX4 accepts it only with MAV_FRAME_MISSION, ArduPilot with any frame.
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
@@ -210,13 +210,14 @@ def pack_items(
     target_system: int = 0,
     target_component: int = 0,
 ) -> bytes:
-    """Encode items (with the vehicle's numbering) as a packed plan.
+    """Encode items as a packed plan. Indices are those of the vehicle, so item 0 of a mission is home.
 
-    A whole plan has ``first`` 0 and no options. When the file is closed, ArduPilot deletes the old items and stores the
-    new ones, up to the first item that it refuses.
+    By default, the plan replaces all items. When the written file is closed, ArduPilot deletes the old items and stores
+    the new items, up to the first item that it refuses.
 
-    The option :data:`NO_CLEAR` is for missions only. The file then replaces or appends items from index ``first`` on,
-    and ArduPilot keeps all other items. Jump targets must be below the number of items in the file (ArduPilot 4.7).
+    With the option :data:`NO_CLEAR`, which is for missions only, the plan replaces items from index ``first`` on, or
+    appends items at the end of the mission. ArduPilot keeps all other items. Jump targets must be below the number of
+    items in the file (ArduPilot 4.7).
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

@@ -21,7 +21,7 @@ _MAX_TEXTS = 6
 def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
     """Describe each vehicle of a failed test in a few lines.
 
-    If ``directory`` is given, a picture of the tracks, the recordings and reports on them are saved there. Their names
+    If ``directory`` is given, save a picture of the tracks there, and each recording with a report. The file names
     begin with the name of the test.
     """
     flights = _flatten(opened)

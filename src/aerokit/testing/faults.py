@@ -25,7 +25,7 @@ class FaultInjector:
     reboot of the vehicle. Raises InvalidArgument for a time or share out of range.
     """
 
-    # With slots, setting an attribute of `Faults` here instead of on `all` raises AttributeError.
+    # With slots, an attempt to set an attribute of `Faults` here raises AttributeError instead of having no effect.
     __slots__ = ("_schedule_with", "_vehicle")
 
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:
@@ -113,7 +113,7 @@ class FaultInjector:
     def _set(
         self, name: str, value: object, after_s: float, for_s: float | None = None, *, healthy_value: object = False
     ) -> None:
-        """Set an attribute of `Faults` after ``after_s``, and reset it to ``healthy_value`` after ``for_s`` more."""
+        """Set an attribute of `Faults` after ``after_s``. Set it to ``healthy_value`` ``for_s`` later."""
         faults = self.all
         end_s = None if for_s is None else after_s + _duration(for_s)
         self._schedule(partial(setattr, faults, name, value), after_s)

@@ -195,9 +195,9 @@ class FaultyLink(Link):
     def stall(self, system_bytes: int = 0) -> None:
         """Stop sending until :meth:`drain`, like TCP over an interrupted network.
 
-        The simulated operating system accepts ``system_bytes``, which arrive after :meth:`drain`. Further bytes are
-        queued. They are dropped after a second in the queue, or at once by :meth:`discard_unsent`. A second call
-        without :meth:`drain` drops the bytes of the first one. The link must be open.
+        The simulated operating system accepts the first ``system_bytes`` bytes, which arrive after :meth:`drain`.
+        Further bytes are queued. They are dropped after a second in the queue, or at once by :meth:`discard_unsent`. If
+        the link is already stalled, its unsent bytes are dropped and a new stall begins. The link must be open.
         """
         if self._stalled_queue is not None:
             self._stalled_queue.close()
@@ -207,7 +207,7 @@ class FaultyLink(Link):
         """Resume sending after :meth:`stall`."""
         if self._stalled_queue is not None:
             self._stalled_queue.drain()
-            self._on_stalled(False)  # After a second `stall`, the new queue does not report the end of the first stall.
+            self._on_stalled(False)  # A queue that a second `stall` replaced does not report the end of its stall.
 
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`."""

@@ -31,7 +31,7 @@ class SentText:
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A message that reached the vehicle, was addressed to the vehicle, and is supported by its firmware."""
+    """A received message that was addressed to the vehicle and is supported by its firmware."""
 
     time_s: float
     """Simulated seconds."""

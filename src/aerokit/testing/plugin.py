@@ -247,7 +247,7 @@ def _only_on_virtual_time(test_with_open_flights: Callable[..., Any]) -> Callabl
 def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] | None = None) -> Callable[..., None]:
     """Return a function that runs an ``async def`` test on virtual time.
 
-    It calls ``try_first`` first. If this raises `_NotVirtualTime`, ``test`` runs on a new loop.
+    If ``try_first`` is given, the function calls it, and runs ``test`` only if it raises `_NotVirtualTime`.
     """
 
     @functools.wraps(test)

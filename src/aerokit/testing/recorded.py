@@ -91,7 +91,7 @@ class RecordedParameters(ParameterProtocolServer):
         if name not in self.names:
             self._refuse(request, index=-1, channel=channel)  # -1 because the request has no index
             return
-        # Without a successful write in the recording, the parameter keeps its value. The answer is the present value.
+        # Only parameters that were set in the recording can be set. The answer always contains the current value.
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
         self.send(name, self.names.index(name), None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
@@ -34,6 +34,14 @@ _REQUEST_IDS = frozenset(
     kind.ID
     for kind in (*_COMMANDS, *_ITEMS, m.ParamSet, m.MissionCount, m.MissionClearAll)
 )  # fmt: skip
+
+
+_ItemsByIndex = dict[int, m.MissionItemInt | m.MissionItem]
+
+
+class _Download(NamedTuple):
+    item_count: int
+    items: _ItemsByIndex
 
 
 @dataclass
@@ -90,9 +98,9 @@ class RecordedFlight:
         """True if the vehicle requests items by MISSION_REQUEST_INT, False by MISSION_REQUEST."""
         self.duration_s: float = 0.0
         self._unconfirmed_sets: dict[str, float] = {}  # values of PARAM_SET that are not confirmed yet, by name
-        # Transfers in progress by MAV_MISSION_TYPE. An upload has its items by index, a download its count and items.
-        self._uploads: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
-        self._downloads: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}
+        # Transfers in progress, by MAV_MISSION_TYPE.
+        self._uploads: dict[int, _ItemsByIndex] = {}
+        self._downloads: dict[int, _Download] = {}
         self._clearing: set[int] = set()  # types of which MISSION_CLEAR_ALL is not answered yet
         self._read(frames)
 
@@ -171,16 +179,18 @@ class RecordedFlight:
             self.settable.add(value.param_id)
 
     def _read_count(self, count: m.MissionCount, now: float) -> None:
-        self._downloads[count.mission_type] = (count.count, {})
+        self._downloads[count.mission_type] = _Download(count.count, {})
         if count.count == 0:
             self.plans.append(RecordedPlan(now, count.mission_type, ()))
 
     def _read_item(self, item: m.MissionItemInt | m.MissionItem, now: float) -> None:
-        count, items = self._downloads.get(item.mission_type, (0, {}))
-        items[item.seq] = item
-        if count and len(items) == count:
+        download = self._downloads.get(item.mission_type)
+        if download is None:
+            return
+        download.items[item.seq] = item
+        if len(download.items) == download.item_count:
             del self._downloads[item.mission_type]
-            self._add_plan(item.mission_type, items, now)
+            self._add_plan(item.mission_type, download.items, now)
 
     def _read_mission_ack(self, ack: m.MissionAck, now: float) -> None:
         # The acknowledgement ends the upload that is in progress. Without an upload, it answers MISSION_CLEAR_ALL.

@@ -55,7 +55,7 @@ class ServedFlight:
 
     @contextmanager
     def raising_vehicle_errors(self) -> Iterator[None]:
-        """Context manager that raises an exception of the simulated vehicle as soon as it occurs.
+        """End the block with an exception of the simulated vehicle as soon as the vehicle raises it.
 
         The vehicle's link is closed, which ends calls that wait for the vehicle. The main thread is interrupted as by
         Ctrl-C, which ends programs that poll.

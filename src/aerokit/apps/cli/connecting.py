@@ -174,10 +174,10 @@ def add_action(
 
 
 async def is_declined(options: argparse.Namespace, action: str, question: str, outcome: str) -> bool:
-    """Ask the user a question; return True if the answer is no.
+    """Ask the user for confirmation. Return True if the user declines, or if stdin is not a terminal.
 
-    With ``--yes``, the question is not asked. The answer is no if stdin is not a terminal. ``outcome`` ends the text
-    that is printed after a no, such as "sent" in "nothing was sent".
+    With ``--yes``, return False without asking. ``outcome`` is the last word of the text printed after a refusal:
+    "sent" in "nothing was sent".
     """
     if options.yes or (is_interactive() and await confirm(question)):
         return False
@@ -212,8 +212,8 @@ def command_action(
 async def connected(options: argparse.Namespace, *, changes: bool = False) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle that the options name, without requesting message rates.
 
-    Commands that change something on the vehicle set ``changes``. The user must then choose a vehicle with
-    ``--system-id`` if several are on the link.
+    ``changes`` means that the command changes something on the vehicle. If several vehicles are on the link, the user
+    must then choose one with ``--system-id``.
     """
     async with connect_to(
         options,

@@ -152,7 +152,7 @@ class _SquareFlight(SupervisedFlight):
     async def _take_off(self, altitude_m: float) -> None:
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready")
-        # This only describes a take-off, and sends nothing. The altitude of home does not matter for the check.
+        # `autopilot.take_off` sends nothing. Whether it returns None does not depend on the altitude of home.
         if vehicle.autopilot.take_off(altitude_m, home_altitude_amsl_m=0.0, is_vtol=vehicle.is_vtol) is None:
             raise NotSupported(f"demo: {vehicle.autopilot.firmware} cannot take off")
         await record_parameters(vehicle, self._print)
@@ -166,7 +166,7 @@ class _SquareFlight(SupervisedFlight):
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # After another party has changed the mode, a hold or a landing may be that party's command, too.
+        # If another party has changed the mode, it may also have ordered a hold or a landing.
         return ("take_off", "setpoint") if self._was_overruled else ("take_off", "setpoint", "hold", "land")
 
     async def _after_failure(self, error: Exception) -> int:

@@ -34,7 +34,7 @@ BAUD_RATES = (57600, 115200, 921600, 460800, 230400, 500000, 38400, 19200, 9600)
 _MIN_FRAMES = 2
 _MARKS: dict[str, str] = {"ok": "ok  ", "note": "note", "problem": "BAD "}
 _MAX_LOSS = 0.02
-# The default system and component id of programs that use aerokit. `aerokit doctor` itself has another system id.
+# Default system and component id of programs that use aerokit, other than `aerokit doctor`.
 _PROGRAM_IDS = (255, 190)
 # The loss is reported only if at least this many frames were received.
 _MIN_FRAMES_FOR_LOSS = 20

@@ -108,7 +108,7 @@ async def _report(options: argparse.Namespace) -> int:
     from aerokit.logs.report import write_report
 
     target = options.output or options.log.with_suffix(".html")
-    # Names are checked first: if a log's name is wrong, an error about the derived name of the report would mislead.
+    # Check the names of the logs first, because the default name of the report is derived from one of them.
     for log in logs:
         check_log_name(log)
     check_not_existing(target, options)

@@ -67,7 +67,8 @@ class PlanFlight(SupervisedFlight):
         self.sent_text = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
         self.sent_text = "the plan is on the vehicle, nothing was armed"
-        # Another station may change the mission before the start, but it cannot reach a simulated vehicle.
+        # The mission is compared again before the start, because another ground station may have changed it. Other
+        # stations cannot reach a vehicle that this program simulates.
         uploaded_mission = () if self._options.sim else await self._download_mission()
         if self._options.record is not None:
             await record_parameters(vehicle, self._print)
@@ -164,11 +165,8 @@ class PlanFlight(SupervisedFlight):
             group.cancel_scope.cancel()
 
     async def _explain_wait(self, mode: str) -> None:
-        """After a change to ``mode``, print how long the flight waits for the end of the mission.
-
-        Nothing is printed if the mission is reported as ended within the first quarter of this time.
-        """
-        delay_s = END_GRACE_S / 4
+        """Print how long the flight waits for the end of the mission after a change to ``mode``."""
+        delay_s = END_GRACE_S / 4  # Within this time, the mission may end, or the vehicle may leave the mode.
         await anyio.sleep(delay_s)
         vehicle = self._vehicle
         is_unexplained = vehicle.mode_name == mode and not self._is_in_our_mode and not vehicle.mission.explains_mode

@@ -63,10 +63,9 @@ def _print_json(fields: Mapping[str, object]) -> None:
 
 
 def can_print(stream: TextIO | None = None) -> bool:
-    """Return False while printing would block: after Ctrl-S, or if a pipe is not read.
+    """Return False if printing would block, for example after Ctrl-S. The default stream is stdout.
 
-    Commands on which vehicles depend must not print then, because heartbeats and forwarding would stop. The default
-    stream is stdout.
+    A blocked program sends no heartbeats and forwards no frames.
     """
     try:
         _, writable, _ = select.select([], [sys.stdout if stream is None else stream], [], 0)

@@ -175,7 +175,7 @@ async def _set(options: argparse.Namespace) -> int:
             check_allowed(metadata, values)
         results = await vehicle.parameters.set_many(values, idle_timeout_s=options.patience)
         known_names = await _names_for_hints(vehicle, results.values())
-    # Without metadata, one line at the end replaces the notes on the results. JSON always has the notes.
+    # Without metadata, every result would have the same note. Text output then has a single line at the end instead.
     has_notes = metadata is not None or options.json
     if has_notes and not options.force:
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}

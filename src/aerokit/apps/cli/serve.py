@@ -185,7 +185,7 @@ def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None
     # A browser cannot open an address that stands for all interfaces.
     host = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(str(options.host), str(options.host))
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
-    # Browsers do not send the part after the #, so that the token never reaches a server log.
+    # Browsers do not send the part after the #, so the token never appears in a server log.
     page = url if options.read_only and _is_loopback(options.host) else f"{url}#token={app.token}"
     source = f"simulated vehicles: {options.sim}" if options.sim else options.address
     record = {"url": url, "page": page, "token": app.token, "source": source, "read_only": options.read_only}

@@ -350,10 +350,10 @@ def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
 
 
 def _client_address(address: str, argument: str) -> str:
-    """Return the address with which a client on this machine connects to a simulator.
+    """Return the address with which a client on this machine connects to the simulator's link.
 
-    ``address`` is the address of the open link, and ``argument`` that of the command line. A serial line has no such
-    address, so the result is a placeholder.
+    ``address`` is the address of the open link, ``argument`` the address given on the command line. The result for a
+    serial line is a placeholder, because the device at its other end is unknown.
     """
     scheme, _, location = address.partition(":")
     if scheme == "zenohin":

@@ -86,7 +86,7 @@ class SupervisedFlight(ABC):
     async def fly(self) -> int:
         """Perform the flight, and return the exit code.
 
-        After an error or Ctrl-C, the vehicle is made safe. Errors are then raised again.
+        After an error or Ctrl-C, make the vehicle safe. Then raise the error again.
         """
         try:
             code = await self._interrupts.run(self._fly)
@@ -146,10 +146,7 @@ class SupervisedFlight(ABC):
                 await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=_AUTO_DISARM_TIMEOUT_S)
 
     async def _make_safe(self, action: Callable[[], Awaitable[int]]) -> None:
-        """Run an action that makes the vehicle safe.
-
-        An error or another Ctrl-C ends it. No further commands are sent then.
-        """
+        """Run an action that makes the vehicle safe. After an error or another Ctrl-C, send no further commands."""
         try:
             if await self._interrupts.run(action) is None:
                 self._print(f"interrupted again; no further commands: vehicle {self._vehicle.describe_now()}")
@@ -201,7 +198,7 @@ class SupervisedFlight(ABC):
             elif action == "hold":
                 await vehicle.hold()
         except CommandRejected as error:
-            # Without a position, for example, autopilots refuse to return. The vehicle must not simply fly on.
+            # For example, autopilots refuse to return without a position. The vehicle is then held instead.
             if action == "hold" or not self._check_control():
                 raise
             self._print(f"{text} failed: {plain_text(error)}; {INTERRUPT_ACTIONS['hold']} instead")
@@ -250,8 +247,9 @@ class SupervisedFlight(ABC):
     @property
     def _is_in_our_mode(self) -> bool:
         vehicle = self._vehicle
-        if not (self._has_changed_mode or self._has_left_mode) and vehicle.mode_name in self._modes_armed_in:
-            return self._is_armed_on_ground  # This program has not taken off. In the air, a pilot is flying.
+        has_only_armed = not (self._has_changed_mode or self._has_left_mode)
+        if has_only_armed and vehicle.mode_name in self._modes_armed_in:
+            return self._is_armed_on_ground  # If the vehicle is in the air, a pilot has taken off.
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 
@@ -267,7 +265,7 @@ class FlightReport:
         self._options = options
         self.speedup: float = speedup
         self._clocks = ClockComparison()
-        # Seconds of this computer's clock, not of the vehicle's, which a simulation may speed up.
+        # These times are of this computer's clock. The clock of a simulated vehicle may run faster.
         self._armed_at: float | None = None
         self._armed_s = 0.0
         self._fast_sink_at: float | None = None  # when the vehicle last descended at IMPACT_M_S or faster
@@ -328,7 +326,7 @@ class FlightReport:
         is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured_speed)
         speed = measured_speed if is_unknown_simulation else self.speedup
         seconds = speed * (vehicle.connection.now() - self._started_at)
-        self._on_armed(None, is_armed=False)  # if the vehicle is still armed, adds the time since arming
+        self._add_armed_time()
         version = vehicle.version.latest
         batteries = vehicle.batteries.latest or ()
         record = {
@@ -384,10 +382,14 @@ class FlightReport:
         return f"armed for {_duration(speed * self._armed_s)}" + (f" ({'; '.join(notes)})" if notes else "")
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
-        now = self._vehicle.connection.now()
+        self._add_armed_time()
+        self._armed_at = self._vehicle.connection.now() if is_armed else None
+
+    def _add_armed_time(self) -> None:
+        """Add the time since arming to the seconds armed. Does nothing if the vehicle is disarmed."""
         if self._armed_at is not None:
-            self._armed_s += now - self._armed_at
-        self._armed_at = now if is_armed else None
+            self._armed_s += self._vehicle.connection.now() - self._armed_at
+            self._armed_at = None
 
     async def _compare_clocks(self) -> None:
         with self._vehicle.subscribe(GlobalPositionInt, capacity=100) as messages, contextlib.suppress(AerokitError):

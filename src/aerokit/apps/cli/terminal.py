@@ -109,8 +109,7 @@ def on_interrupt(
     def handle(number: int, _: object) -> None:
         nonlocal has_hung_up
         # When a terminal or an SSH session ends, both the shell and the kernel send a SIGHUP, a moment apart. The
-        # second one is ignored. As a second signal, like a second Ctrl-C, it would cancel the action that makes the
-        # vehicle safe.
+        # second SIGHUP is ignored. Like a second Ctrl-C, it would cancel the action that makes the vehicle safe.
         if number not in (signal.SIGINT, signal.SIGTERM):
             if has_hung_up:
                 return

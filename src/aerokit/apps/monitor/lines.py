@@ -54,7 +54,7 @@ def age(seconds: float) -> str:
 
 
 class VehicleText:
-    """Texts of one vehicle. Without heartbeats, values are dim, and one line says how long the vehicle is silent."""
+    """Texts that show one vehicle. If the vehicle is silent, its values are dim, and one line says for how long."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle

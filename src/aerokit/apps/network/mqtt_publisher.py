@@ -39,7 +39,7 @@ _POLL_INTERVAL_S = 1.0
 
 
 class BrokerAddress(Snapshot):
-    """Address of a broker, and the names of fleet and vehicle under which to publish.
+    """Address of a broker, with the names of the fleet and the vehicle whose states are published.
 
     ``str`` and ``repr`` omit user and password.
     """
@@ -262,7 +262,7 @@ def _close_socket(client: Any) -> None:
 
 
 class _NullReceiver:
-    """Ignores everything. `ReconnectingLink` itself logs that the connection is lost or restored."""
+    """Ignores received data and lost connections. `ReconnectingLink` logs the latter."""
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         pass

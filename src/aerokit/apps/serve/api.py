@@ -273,6 +273,17 @@ class Operation:
     """True if the operation needs no token, because it reveals nothing about vehicles."""
 
 
+@dataclass(frozen=True)
+class _Download:
+    plan: Mission | Fence | RallyPoints
+    received_at: float
+    version: tuple[int, int]
+
+    def is_outdated(self, version: tuple[int, int], count: int | None) -> bool:
+        """Return True if the plan's version has changed, or the vehicle reports another number of items."""
+        return version != self.version or count not in (None, len(self.plan.to_items()))
+
+
 class HttpApi:
     def __init__(
         self,
@@ -288,8 +299,8 @@ class HttpApi:
         self._settings = settings
         self._metadata = metadata
         self._locks: dict[Vehicle, asyncio.Lock] = {}
-        # Downloaded missions, fences and rally points, with the time of each download, and the version downloaded.
-        self._plans: dict[tuple[Vehicle, str], tuple[Mission | Fence | RallyPoints, float, tuple[int, int]]] = {}
+        # The last download of each vehicle's mission, fence and rally points.
+        self._downloads: dict[tuple[Vehicle, str], _Download] = {}
         served.listen(self._on_message)
 
     def operations(self) -> tuple[Operation, ...]:
@@ -387,23 +398,21 @@ class HttpApi:
         """Return the mission, fence or rally points of a vehicle, and their age in seconds."""
         vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
-            plan, read_at, version = self._plans.get((vehicle, kind), (None, 0.0, None))
+            download = self._downloads.get((vehicle, kind))
             control = getattr(vehicle, kind)
             count = vehicle.mission.count.latest if kind == "mission" else None
-            has_other_count = plan is not None and count is not None and count != len(plan.to_items())
-            has_changed = has_other_count or version != control._version
-            if plan is None or has_changed or is_refresh:
+            if download is None or is_refresh or download.is_outdated(control._version, count):
                 plan = await control.download()
-                read_at = vehicle.connection.now()
-                self._plans[vehicle, kind] = plan, read_at, control._version
-        return plan, to_jsonable(vehicle.connection.now() - read_at)
+                download = _Download(plan, vehicle.connection.now(), control._version)
+                self._downloads[vehicle, kind] = download
+        return download.plan, to_jsonable(vehicle.connection.now() - download.received_at)
 
     def _on_message(self, message: dict[str, Any]) -> None:
-        # Drop the stored plans even if the upload failed, because it may have changed plans on the vehicle.
+        # Drop the stored downloads even if the upload failed, because it may have changed plans on the vehicle.
         if message["type"] == "order" and message["order"] == "mission/upload":
-            for vehicle, kind in tuple(self._plans):
+            for vehicle, kind in tuple(self._downloads):
                 if vehicle.system_id == message["system_id"]:
-                    del self._plans[vehicle, kind]
+                    del self._downloads[vehicle, kind]
 
     async def _check_plan(self, request: Request) -> Response:
         self._access.check(request.headers, needs_token=True)  # before parsing, which takes long for large plans

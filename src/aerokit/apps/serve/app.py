@@ -105,7 +105,7 @@ def make_app(
 
     Args:
         source: a connection (its vehicles are served when they appear), one vehicle, or a mapping of system ids to
-            vehicles. The caller must close them, after the application.
+            vehicles. The application does not close them; close them after the application has ended.
         token: 16 to 256 characters of A-Z, a-z, 0-9, - . _ ~; None: a random token, in ``app.token``.
         read_only: reject all orders.
         open_reading: allow reading without the token; orders always need it.

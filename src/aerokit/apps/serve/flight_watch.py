@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.mavlink.enums import MavLandedState, MavType
 from aerokit.vehicle.commanding.ground import IMPACT_M_S, STILL_M_S, ImpactDetector
@@ -50,6 +50,11 @@ CRASH_LANDED_MAX_AGE_S = 3.0
 _IN_AIR = (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING)
 
 
+class _Disarming(NamedTuple):
+    at: float
+    armed_for_s: float
+
+
 class FlightWatch:
     """Detects a crash of one vehicle, and disarming without an order. Sends nothing.
 
@@ -75,13 +80,14 @@ class FlightWatch:
         # Start of the time without motion after the impact, and number of velocity reports since then.
         self._still_since = math.inf
         self._still_samples = 0
-        self._moving_since = math.inf  # after a crash: when the vehicle began to move
-        self._take_off_altitude_m: float | None = None  # after a crash: where a take-off was reported
-        self._armed_at: float | None = None  # None if the vehicle was armed before this object was created
-        self._armed_until = -math.inf  # when the vehicle was last disarmed
+        # Set after a crash: start of a movement, and altitude at which the vehicle reported a take-off.
+        self._moving_since = math.inf
+        self._take_off_altitude_m: float | None = None
+        self._armed_at: float | None = None  # None if the time of arming is unknown
+        self._disarmed_at = -math.inf
         self._was_in_air = False  # True if the vehicle was in the air since the last arming
         self._disarm_ordered_at = -math.inf
-        self._disarming: tuple[float, float] | None = None  # time of the disarming, and seconds armed before it
+        self._disarming: _Disarming | None = None
         self._detachments: tuple[Callable[[], None], ...] = (
             vehicle.velocity.observe(self._on_velocity, every_arrival=True),
             vehicle.armed.observe(self._on_armed),
@@ -140,16 +146,16 @@ class FlightWatch:
     def _on_armed(self, before: bool | None, is_armed: bool) -> None:
         now = self._now()
         if is_armed:
-            # If the vehicle was armed before this program started, the time of arming is unknown.
+            # If no report of a disarmed vehicle came before, the vehicle may have been armed long ago.
             self._armed_at = now if before is False else None
             self._was_in_air = self._vehicle.landed_state.latest in _IN_AIR
             self._disarming = None
             self._reset()
         elif before:
-            self._armed_until = now
+            self._disarmed_at = now
             was_ordered = now - self._disarm_ordered_at <= DISARM_ORDER_MAX_AGE_S
             if self._armed_at is not None and not self._was_in_air and not was_ordered and self._crash is None:
-                self._disarming = now, now - self._armed_at
+                self._disarming = _Disarming(at=now, armed_for_s=now - self._armed_at)
 
     def _on_landed(self, before: int | None, landed: int) -> None:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
@@ -185,7 +191,7 @@ class FlightWatch:
         self._impact_altitude_m = altitude_amsl(self._vehicle.telemetry)
         self._was_sudden_stop = self._last_sink_m_s - down_m_s >= CRASH_STOP_M_S2 * (at - self._last_sink_at)
         armed = self._vehicle.armed.latest
-        self._is_impact_dismissed = not armed and at - self._armed_until > CRASH_ARMED_WITHIN_S
+        self._is_impact_dismissed = not armed and at - self._disarmed_at > CRASH_ARMED_WITHIN_S
 
     def _evaluate_impact(self, at: float, ground_speed_m_s: float, vertical_speed_m_s: float) -> None:
         if self._is_impact_dismissed or self._impact_at is None:
@@ -194,8 +200,7 @@ class FlightWatch:
         if self._crash is not None:
             self._moving_since = math.inf if is_still else min(self._moving_since, at)
             is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
-            # A slow vehicle counts as flying only after it has moved for CRASH_STILL_S, the time it had to lie still
-            # before it counted as crashed.
+            # A slow movement must last as long as the vehicle had to lie still before it counted as crashed.
             is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
             if self._vehicle.armed.latest and (is_moving or self._has_climbed):
                 self._dismiss_impact()  # the vehicle flies again

@@ -110,8 +110,8 @@ def content_policy(tiles: str | None) -> str:
 class SecurityMiddleware:
     """ASGI middleware that rejects foreign hosts and origins, and adds security headers to every response.
 
-    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``. This prevents DNS rebinding. If a
-    browser sends an Origin, it must be this server. Pages of other sites therefore cannot make requests.
+    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``. This prevents DNS rebinding. An
+    Origin header must name this server, so pages of other sites cannot make requests.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], tile_url: str | None) -> None:
@@ -176,10 +176,10 @@ RawHeaders = list[tuple[bytes, bytes]]
 
 
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
-    """Return a class that limits anonymous connections, for the argument ``http`` of `uvicorn.Config`.
+    """Return a protocol class for the argument ``http`` of `uvicorn.Config`. It limits anonymous connections.
 
-    A connection is anonymous until one of its requests has the token. If there are too many, one of the anonymous
-    connections is closed.
+    A connection is anonymous until one of its requests has the token. If there are too many anonymous connections, one
+    of them is closed.
     """
     anonymous: dict[_HttpConnection, None] = {}
 
@@ -224,7 +224,7 @@ class _HttpConnection(H11Protocol):
                 self._anonymous.pop(self, None)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        self._remove_from_anonymous()  # not counted here, because the application itself limits WebSockets
+        self._remove_from_anonymous()  # The application itself limits the number of WebSockets.
         super().handle_websocket_upgrade(event)
 
     def _start_timer(self) -> None:

@@ -144,7 +144,7 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Met
 
 
 def parameter_order(metadata: Metadata | None) -> OrderType:
-    """Return the order type that sets a parameter. Its result has a note if the value's range was not checked."""
+    """Return the type of orders that set a parameter. Their results say if a value's range was not checked."""
     return replace(SET_PARAMETER, run=partial(_set_parameter, metadata=metadata))
 
 
@@ -326,10 +326,12 @@ class OrderRunner:
     ) -> OrderRecord:
         """Start an order, or return the earlier order with this key.
 
-        ``order_type.check`` must have accepted the arguments. Raises HttpProblem for a missing or used key, an
-        outdated ``seen_at_s``, or a ``force`` that is not allowed. Raises InvalidArgument or FileFormatError if the
-        arguments cannot be parsed, BusyError if too many orders are running, HeartbeatTimeout if the vehicle is
-        silent, and ConnectionClosed or LinkLost if the connection has ended.
+        The caller must have checked the arguments with ``order_type.check``.
+
+        Raises HttpProblem for a missing or used key, an outdated ``seen_at_s``, or a ``force`` that is not allowed.
+        Raises InvalidArgument or FileFormatError if the arguments cannot be parsed, BusyError if too many orders are
+        running, HeartbeatTimeout if the vehicle is silent, and ConnectionClosed or LinkLost if the connection has
+        ended.
         """
         if not _KEY.fullmatch(key):
             raise HttpProblem(
@@ -454,7 +456,10 @@ class OrderRunner:
         self._publish(record)
 
     def _replaced_by(self, record: OrderRecord, error: Exception) -> str | None:
-        """Return the key of the newest later motion order if ``error`` says that this order was replaced; else None."""
+        """Return the key of the order that replaced ``record``: the newest later order for motion.
+
+        Return None if ``error`` does not say that ``record`` was replaced.
+        """
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
         newest_key = None

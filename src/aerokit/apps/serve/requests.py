@@ -46,7 +46,7 @@ BODY_TIMEOUT_S = 10.0
 
 
 class HttpProblem(Exception):
-    """A request failed. ``kind`` is the value of ``error`` in the response, by which programs know the problem."""
+    """A request failed. Clients recognise the problem by its ``kind``, which is ``error`` in the response."""
 
     def __init__(self, status: int, kind: str, text: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(text)

@@ -186,13 +186,13 @@ class ServedVehicles:
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
     async def _record_tracks(self) -> None:
-        silent: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
+        interrupted: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
                 self._watch(vehicle)  # begins to watch a new vehicle
                 position = vehicle.position.latest
                 if position is None or vehicle.position.age > TRACK_GAP_S:
-                    silent.add(system_id)
+                    interrupted.add(system_id)
                     continue
                 track = self._tracks.setdefault(system_id, [])
                 if track:
@@ -201,8 +201,8 @@ class ServedVehicles:
                         continue
                 if len(track) >= MAX_TRACK_POINTS:
                     _thin_out(track)
-                track.append((position, system_id in silent))
-                silent.discard(system_id)
+                track.append((position, system_id in interrupted))
+                interrupted.discard(system_id)
             await anyio.sleep(TRACK_INTERVAL_S)
 
     async def _request_arming_checks(self) -> None:
