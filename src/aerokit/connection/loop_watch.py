@@ -26,7 +26,7 @@ MIN_IDLE_ITERATIONS = 3
 
 MAX_SLEEPS = 16
 
-# Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes that time.
+# Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes it.
 CLOCKS = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
@@ -134,7 +134,7 @@ class LoopWatch:
         if has_slept or late_s > LATE_THRESHOLD_S:
             self._start_catching_up()
         self._set_timer(now)
-        # The pause may have begun just after the timer was set, so its maximum length is reported.
+        # The pause began at the earliest when the timer was set. We report this maximum length.
         if late_s > BLOCKED_THRESHOLD_S:
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 

@@ -223,7 +223,8 @@ class _Discovery:
     """Finds the system ids to connect to, by network: the requested ones, or all found that have no vehicle object yet.
 
     ``requested`` maps networks to system ids, or to None for all. ``count`` is the total number of vehicles to wait
-    for, with the ``passed_count`` vehicles that the program passed to ``fleet()``; None: at least one on each network.
+    for; None: at least one on each network. The count includes the ``passed_count`` vehicles that the program passed to
+    ``fleet()``.
     """
 
     def __init__(

@@ -111,7 +111,7 @@ class Switch:
     ) -> None:
         """Forward frames received at a port.
 
-        ``data`` is the received bytes. It is None if some of the bytes do not belong to the frames.
+        ``data`` has the received bytes, or is None if they contain more than the frames.
         """
         # Hot path: local variables are faster than attributes.
         ingress, guard, peer = port.ingress, port.guard, port.peer

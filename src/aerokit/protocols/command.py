@@ -33,7 +33,7 @@ MAX_ATTEMPTS = 4
 
 
 class Repetition(NamedTuple):
-    """Further effect of a repeated command. With ``param`` (1 to 7), only if this parameter has this value."""
+    """Further effect of a repeated command. If ``param`` (1 to 7) is given, only if that parameter equals ``value``."""
 
     effect: str
     param: int | None = None
@@ -89,7 +89,7 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# Interval of the checks for a new HEARTBEAT, after which a command with an `OrderStatus` may be repeated.
+# A command with an `OrderStatus` is repeated only after a new HEARTBEAT. We check for one at this interval.
 POLL_INTERVAL_S = 0.05
 
 MAX_HEARTBEAT_AGE_S = 2.5
@@ -260,7 +260,7 @@ class CommandExchange(Exchange[CommandAck]):
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
         # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
-        # command is repeated. A command with a single attempt ignores none, because its own may be the only one.
+        # command is repeated. A command with a single attempt ignores none, because it may get only one.
         may_ignore = self._transmitted_count == 1 and self._attempts > 1
         is_to_earlier_command = not self._transmitted_count or (may_ignore and self.answers < self._earlier_answers)
         if message.result != MavResult.IN_PROGRESS:
@@ -327,8 +327,8 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        # From the earlier deadline on, `_expire_order` checks whether the command may be repeated.
         if self._order_status is not None:
+            # From this deadline on, `_expire_order` checks whether the command may be repeated.
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 

@@ -204,7 +204,7 @@ class MessageStream:
     def on_message(self, now: float, messages: int) -> None:
         """Record a message. ``messages`` is the number sent since the previous message, including lost ones.
 
-        It is 0 or less for a repeated or delayed message. The time before such a message is not measured.
+        For a repeated or delayed message, ``messages`` is 0 or less. The time before such a message is not measured.
         """
         elapsed_s = now - self._last_at
         if self._has_started and messages > 0:

@@ -130,8 +130,8 @@ class MissionExchange(Transfer[ResultT]):
         return self.round_trip.timeout_s(backoff_attempt)
 
     def _reject(self, result: int, *, seq: int | None = None) -> None:
-        is_item = seq is not None and seq >= self.offset  # an item before the offset is home
-        item = seq - self.offset if seq is not None and is_item else None
+        # An index before the offset is the home position, which is no item of the caller.
+        item = None if seq is None or seq < self.offset else seq - self.offset
         subject = "" if item is None else f" item {item}"
         reason = RESULTS.get(result, f"result {result}")
         self._fail(MissionRejected(f"{self.kind}: the vehicle refused{subject}: {reason}", result=result, item=item))

@@ -248,7 +248,7 @@ class RunningCommands:
         if not running.cancel():
             self._running[command.command] = running
             return False
-        # If both commands have the same sender, it would take CANCELLED for the answer to `command`.
+        # A sender of both commands would take CANCELLED for the answer to `command`.
         if running.command.sender != command.sender:
             self._server.answer(running.command, MavResult.CANCELLED)
         return True

@@ -313,7 +313,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _send_block(self, client: ServedClient, session: FtpSession, request: FtpPacket, *, may_end: bool) -> None:
         """Send a block of a burst, or the NAK that ends the burst.
 
-        With ``may_end``, this block is the burst's last one if it has sent enough bytes.
+        With ``may_end``, this block ends the burst if the burst has sent enough bytes.
         """
         refusal = request.refuse(MavFtpErr.EOF)
         try:
