@@ -234,7 +234,7 @@ class FrameReceiver:
     def arrived_at(self) -> float:
         """Return the earliest possible receive time of the current frame.
 
-        It is before now if the frame may have waited in the socket.
+        This time is earlier than now if the frame may have waited in the socket.
         """
         now, oldest = self._clock(), self._loop_watch.oldest_arrival
         return now if now < oldest else oldest

@@ -419,7 +419,7 @@ class Shows(Travel):
         conflicts = [
             conflict
             for conflict in find_conflicts(paths, min_m, slack_s=CONFLICT_SLACK_S)
-            if conflict.name not in stationary  # two members that both stay where they are
+            if conflict.name not in stationary  # Otherwise both members stay where they are.
         ]
         if conflicts:
             conflict = conflicts[0]

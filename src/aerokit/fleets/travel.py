@@ -227,7 +227,7 @@ class Travel(SelectionBase):
         moving = [members[name] for name in targets if members[name].is_available]
         if not moving:
             return [], {}
-        origin = LocalOrigin(targets[moving[0].name])  # It stays the same while the members move.
+        origin = LocalOrigin(targets[moving[0].name])  # The targets stay the same while the members move.
         routes = [
             Route(
                 member.name,
