@@ -372,8 +372,8 @@ class MemberConnections:
         self._has_block_failed = error is not None
         self._close.set()
         # If a task is still connecting, opening has failed, and cancelling all tasks is enough.
-        is_no_task_connecting = len(self._connected) == self._running_task_count
-        if self._running_task_count and is_no_task_connecting:
+        are_all_connected = len(self._connected) == self._running_task_count
+        if self._running_task_count and are_all_connected:
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 

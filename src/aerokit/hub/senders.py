@@ -83,7 +83,7 @@ class Sender:
         return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if this is the sender's port, or if its frames arrive at both ports."""
+        """Return True if port ``number`` is the sender's port, or if the sender's frames arrive at both ports."""
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:

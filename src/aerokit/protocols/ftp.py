@@ -309,7 +309,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     attempts: int
 
-    # start() sets these attributes.
+    # start() sets this attribute.
     _sent_at: float
 
     def __init__(

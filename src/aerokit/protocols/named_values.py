@@ -278,7 +278,7 @@ class RepeatedAnswers(Generic[ValueT]):
     def are_conclusive(self, *, is_unchanged: bool) -> bool:
         """Return True if the answers suffice to end the write.
 
-        ``is_unchanged`` is True if they have the value from before the write.
+        ``is_unchanged`` is True if the answers have the value from before the write.
         """
         needed = MIN_UNCHANGED_ANSWERS if is_unchanged else MIN_EQUAL_ANSWERS
         return len(self._answers) >= needed

@@ -157,7 +157,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # Read it once more, because a delayed message may have had the old value.
+                self._window.request(name)  # A delayed message may have had the old value, so we read once more.
             else:
                 self._set_result(name, reported, now)
                 self._reject_alternatives(name, now)
