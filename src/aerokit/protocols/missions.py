@@ -212,7 +212,7 @@ class SetCurrentItem(Transfer[None]):
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
 
-    # start() sets these attributes.
+    # start() sets this attribute.
     _sent_at: float
 
     def __init__(
