@@ -139,9 +139,9 @@ class Router(Generic[PortT]):
         self.on_autopilot: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, the port of the frame, and the port at which it came before.
+        """Called with the kind of event, the sender, the port of the frame, and another port that received the sender.
 
-        The last one is None if that port was removed since.
+        The other port is None if it was removed since.
         """
 
     def add(self, port: PortT) -> Ingress[PortT]:

@@ -80,7 +80,8 @@ def allowed_attempts(command: int, params: Sequence[float]) -> int:
     repetition = UNREPEATABLE_COMMANDS.get(command)
     if repetition is None:
         return MAX_ATTEMPTS
-    return 1 if repetition.param is None or params[repetition.param - 1] == repetition.value else MAX_ATTEMPTS
+    has_effect = repetition.param is None or params[repetition.param - 1] == repetition.value
+    return 1 if has_effect else MAX_ATTEMPTS
 
 
 BROADCAST = 0
@@ -172,9 +173,9 @@ def command_int(
 class CommandExchange(Exchange[CommandAck]):
     """Sends one command, and repeats it until it is acknowledged. The result is the COMMAND_ACK with ACCEPTED.
 
-    Without an ``order_status``, the command is repeated every ``attempt_timeout`` seconds. With an ``order_status``, it
-    is repeated only after a new HEARTBEAT, so never to a silent vehicle, and no longer once ``order_status.end`` has a
-    text.
+    Without an ``order_status``, the command is repeated every ``attempt_timeout`` seconds. With an ``order_status``,
+    each repetition waits for a new HEARTBEAT, so a silent vehicle gets none. Once ``order_status.end`` has a text, the
+    command is not repeated any more.
 
     Acknowledgements to other ground stations, or from other components than the target, are ignored.
 

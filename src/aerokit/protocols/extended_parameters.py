@@ -177,7 +177,7 @@ class SettingWrite(Transfer[Setting]):
     """Set one setting. The result is the setting as the component reports it afterwards.
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
-    answer arrives, the value is read. The next step depends on it:
+    answer arrives, the value is read. The next step depends on the value that the component reports:
 
     - The requested value: the write is complete.
     - The old value (``before``): PARAM_EXT_SET is sent again, because it may have been lost. The write fails if the

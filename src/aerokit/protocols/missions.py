@@ -151,9 +151,7 @@ class MissionClear(MissionExchange[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process the MISSION_ACK. OPERATION_CANCELLED and INVALID_SEQUENCE are ignored: they answer an earlier upload.
-
-        ERROR may answer a late item of an earlier upload, so the request is repeated once.
+        """Process the MISSION_ACK.
 
         A late ACCEPTED of an earlier upload looks like the answer to this request and is accepted. The caller therefore
         reads the number of items afterwards.
@@ -165,10 +163,12 @@ class MissionClear(MissionExchange[None]):
                 self.round_trip.add_sample(now - self._sent_at)
             self._finish(None)
         elif message.type == MavMissionResult.ERROR and not self._has_error:
+            # This ERROR may answer a late item of an earlier upload, so the request is repeated once.
             self._has_error = True
             self._repeat(now)
         elif message.type == MavMissionResult.ERROR and now - self._sent_at < (self.round_trip.fastest_s or 0.0) / 2:
-            return  # It is too early to answer the repetition.
+            return  # This ERROR is too early to answer the repetition.
+        # OPERATION_CANCELLED and INVALID_SEQUENCE answer an earlier upload, so they are ignored.
         elif message.type not in (MavMissionResult.OPERATION_CANCELLED, MavMissionResult.INVALID_SEQUENCE):
             self._reject(message.type)
 
