@@ -207,7 +207,7 @@ class FleetAction:
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if self._has_failed_or_stopped(member):  # This happened before the task began.
+            if self._has_failed_or_stopped(member):  # The failure or the stop came before this task.
                 return
             await self._wait_to_start(member, wait_s)
             value = await self._execute_in_time(member)

@@ -278,8 +278,8 @@ class Port:
                 self._due.clear()  # This bounds the memory. Each message may then be sent once too early.
             self._due[key] = now + period_s
         else:
-            # The next due time is counted from the last one rather than from now, so that irregular messages reach the
-            # allowed average rate. The next due time is never before now, so that no burst follows a pause.
+            # The next due time is counted from the previous due time rather than from now, so that irregular messages
+            # reach the allowed average rate. It is never before now, so that no burst follows a pause.
             self._due[key] = max(due_at, now - period_s) + period_s
         return True
 

@@ -257,7 +257,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, result: int, now: float) -> None:
-        """Begin again. ``result`` is the MAV_MISSION_RESULT to fail with if that is not possible."""
+        """Begin again or, if the upload must not begin again, fail with ``result`` (a MAV_MISSION_RESULT)."""
         if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
             return
         # A partial upload does not begin again, because another station may have changed the vehicle's plan since.
