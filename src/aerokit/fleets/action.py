@@ -230,9 +230,9 @@ class FleetAction:
     async def _wait_to_start(self, member: Member, wait_s: float) -> None:
         """Wait until the member may start. Raises OperationRejected or HeartbeatTimeout if it must not start."""
         before = self._orders_before.get(member.name) or self._orders_of(member)
-        can_be_overruled = self._moves_members or self._kind is ActionKind.ARMS
+        is_checked_at_once = self._moves_members or self._kind is ActionKind.ARMS
         # A landing without a delay is sent even if there is a newer action, because that action may fail.
-        is_overruled = can_be_overruled and (
+        is_overruled = is_checked_at_once and (
             self._has_order_since(member, before) or (not self._ends_flight and self._has_newer_action(member))
         )
         while wait_s > START_TOLERANCE_S and not is_overruled:

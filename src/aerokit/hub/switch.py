@@ -111,7 +111,7 @@ class Switch:
     ) -> None:
         """Forward frames received at a port.
 
-        ``data`` has the received bytes, or is None if they contain more than the frames.
+        ``data`` has the received bytes; None if they are not exactly the bytes of these frames.
         """
         # Hot path: local variables are faster than attributes.
         ingress, guard, peer = port.ingress, port.guard, port.peer
