@@ -104,7 +104,7 @@ class Bus:
         def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
-            detach_all()  # It is defined below, before any frame arrives.
+            detach_all()  # This function is defined below, before any frame arrives.
             # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
                 if entry not in entries_before:
@@ -136,8 +136,8 @@ class Bus:
     ) -> Frame | None:
         """Deliver the frames in order, like :meth:`deliver`. Stop after a frame whose sink sets `must_check_frames`.
 
-        Returns this frame, or None if no sink did. Calls ``before_heartbeat(frame, *context)`` before each HEARTBEAT is
-        delivered.
+        Returns the frame after which delivery stopped; None if all frames were delivered without a stop. Calls
+        ``before_heartbeat(frame, *context)`` before each HEARTBEAT is delivered.
         """
         plans, decode = self._plans, self.dialect.decode
         for frame in frames:
@@ -275,7 +275,7 @@ def copy_exception(error: ErrorT) -> ErrorT:
 
 
 class EndSignal:
-    """Signals once that its owner has ended: stores the error that ended the owner, and passes it to callbacks."""
+    """Stores the error that ended its owner, and passes it to each callback once."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None

@@ -316,8 +316,8 @@ class StateCell(Generic[T]):
 class Changes(AsyncIterator[T]):
     """Asynchronous iterator over the values of a cell.
 
-    Iteration ends only when the cell is closed, by raising the error with which it was closed. While the iterator
-    exists, every received message of the cell is decoded.
+    When the cell is closed, the iterator raises the error with which it was closed. Until then, iteration never ends.
+    While the iterator exists, every received message of the cell is decoded.
     """
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:

@@ -561,9 +561,9 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
-        """Write a frame to the peers of the target of ``message``, or to all peers if it has no target.
+        """Write a frame to the peers of the target of ``message``, or to all peers if the message has no target.
 
-        With ``to``, the target is the system with this id instead. Returns False if nothing was sent.
+        With ``to``, the system with this id is the target instead. Returns False if nothing was sent.
         """
         system_id = getattr(message, "target_system", 0) if to is None else to
         peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)

@@ -190,10 +190,10 @@ class FrameReceiver:
         # Frames that need no checks are delivered together.
         last_delivered = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
         if last_delivered is not None:
-            # One of the sinks of this frame closed the connection, set a signing key or added an observer. The other
-            # frames now need checks. This frame was not yet passed to the observers.
+            # A sink of the last delivered frame closed the connection, set a signing key or added an observer. The
+            # following frames now need checks. The observers have not got the last delivered frame yet.
             self.observers.notify_received(last_delivered, peer)
-            # Frames are compared by identity, so that an equal frame earlier in the list is not taken for this one.
+            # Frames are compared by identity, so `index` does not find an equal frame earlier in the list.
             remaining = frames[frames.index(last_delivered) + 1 :]
             self._check_and_deliver(remaining, framer, peer)
 
@@ -234,7 +234,7 @@ class FrameReceiver:
     def arrived_at(self) -> float:
         """Return the earliest possible receive time of the current frame.
 
-        It is before now if the frame may have waited in the socket.
+        This time is earlier than now if the frame may have waited in the socket.
         """
         now, oldest = self._clock(), self._loop_watch.oldest_arrival
         return now if now < oldest else oldest

@@ -26,7 +26,7 @@ MIN_IDLE_ITERATIONS = 3
 
 MAX_SLEEPS = 16
 
-# Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes that time.
+# Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes it.
 CLOCKS = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
@@ -100,7 +100,7 @@ class LoopWatch:
     def arrival(self, now: float) -> float:
         """Return the receive time of data that is read now.
 
-        It is before ``now`` if the data may have waited.
+        This time is earlier than ``now`` if the data may have waited.
         """
         if now < self._check_sleep_at and self.oldest_arrival < math.inf:
             # The clocks were checked a moment ago, and data that arrived during the last pause may still be unread.
@@ -134,8 +134,8 @@ class LoopWatch:
         if has_slept or late_s > LATE_THRESHOLD_S:
             self._start_catching_up()
         self._set_timer(now)
-        # The pause may have begun just after the timer was set, so its maximum length is reported.
         if late_s > BLOCKED_THRESHOLD_S:
+            # The pause began at the earliest when the timer was set, so this is its maximum length.
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _detect_sleep(self) -> bool:

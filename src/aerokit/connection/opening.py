@@ -222,8 +222,8 @@ def _return_link(link: Link) -> Link:
     return link
 
 
-# Noise of this many bytes contains a pattern that looks like a damaged frame with a probability of about 10 %. Damaged
-# frames are therefore only diagnosed if there is more than one in this many bytes.
+# With a probability of about 10 %, a pattern in this many bytes of noise looks like a damaged frame. Damaged frames are
+# therefore only diagnosed if there is more than one in this many bytes.
 NOISE_BYTES_PER_BAD_CRC = 500
 
 MAX_LISTED_IDS = 5

@@ -73,7 +73,7 @@ class OtherPeer:
 
     @property
     def is_same_sender(self) -> bool | None:
-        """True if this is the owner's sender, which has only changed its address; False if not; None if unknown."""
+        """True if the owner's sender now uses this peer's address; False for another sender; None if unknown."""
         return False if self._sequence_matches is False else self._clock_matches
 
     def has_replaced_owner(self, now: float, rate: float) -> bool:
@@ -216,9 +216,9 @@ class Routes:
         return route is not None and route.peer != peer
 
     def try_move_route(self, frame: Frame, peer: Peer, *, is_signed: bool) -> bool:
-        """Move the route of the frame's sender from its owner to ``peer``, if that is allowed.
+        """Make ``peer`` the owner of the route of the frame's sender, if the rules of this class allow the change.
 
-        Returns True if the route was moved. ``is_signed`` is True if the frame is signed with our key.
+        Returns True if the owner was changed. ``is_signed`` is True if the frame is signed with our key.
         """
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
@@ -284,7 +284,7 @@ class Routes:
         expected = 0
         if route.counters is not None:
             expected = route.counters.expected
-            # The owner may have sent frames that were lost: 50 % more than at its measured rate, and a burst of eight.
+            # The owner's latest frames may be lost. We allow for 1.5 times its rate since its last heartbeat, plus 8.
             max_ahead = 8 + 1.5 * route.rate * silent_s
             # With a larger range, more than half of the 256 sequence numbers would match by chance.
             if max_ahead < 128:
@@ -308,7 +308,7 @@ class Routes:
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        # The others were compared with the old owner.
+        # The other peers were compared with the old owner, so these comparisons are dropped.
         self._other_peers = {
             (component, peer): other for (component, peer), other in self._other_peers.items() if component != source
         }

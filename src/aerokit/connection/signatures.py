@@ -87,7 +87,7 @@ class SignatureFilter:
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
         """Return True if a frame may be delivered. A frame with the new key causes the switch of :meth:`key_handover`.
 
-        With ``may_hand_over=False``, it causes no switch, because it came from another peer than the component's.
+        ``may_hand_over`` is False if the frame did not come from the component's own peer. It then causes no switch.
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)

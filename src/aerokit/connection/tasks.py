@@ -57,9 +57,9 @@ class BackgroundTasks:
     async def aclose(self) -> None:
         """Cancel all tasks and wait for their end, even if the caller is being cancelled.
 
-        Must not be called by one of these tasks, because it would wait for its own end.
+        None of these tasks may call it, because the task would wait for its own end.
         """
-        self.cancel()  # It also prevents new tasks.
+        self.cancel()  # `start` then starts no further tasks.
         cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
         with anyio.CancelScope(shield=True):
             while self._tasks:
@@ -147,7 +147,7 @@ class Deadlines:
         self._timer_at = 0.0  # Stored here, because uvloop's TimerHandle does not return a time in the past.
 
     def set(self, callback: Callback, at: float) -> None:
-        """Call ``callback`` at the loop time ``at``, in seconds. This replaces its earlier deadline."""
+        """Call ``callback`` at the loop time ``at``, in seconds. Replaces an earlier deadline of the callback."""
         self._deadlines[callback] = at
         self._schedule(at)
 

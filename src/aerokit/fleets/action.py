@@ -117,7 +117,7 @@ class FleetAction:
         for member in requested:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
-        # The orders before this action, without members that another action has started since.
+        # Each member's orders before this action. An entry is removed when any action starts the member.
         self._orders_before = {member.name: self._orders_of(member) for member in self._members}
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
@@ -131,11 +131,11 @@ class FleetAction:
         self._policy_order_errors: dict[str, str] = {}
         self._pending_policy_orders = 0  # number of policy orders that have not ended
         self._last_start_at = -math.inf  # when the last member started
-        self._undecided: list[Member] = []  # failed members about which the policy is still to be asked
+        self._undecided: list[Member] = []  # failed members that the policy has not considered yet
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
-        # The order of creation, not of `run`, decides which action is newer.
+        # The action that was created later is the newer one, whichever runs first.
         if self._moves_members:
             for action in context.actions:
                 action._newer_actions.append(self)
@@ -207,7 +207,7 @@ class FleetAction:
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
+            if self._has_failed_or_stopped(member):  # The failure or the stop came before this task.
                 return
             await self._wait_to_start(member, wait_s)
             value = await self._execute_in_time(member)
@@ -230,15 +230,16 @@ class FleetAction:
     async def _wait_to_start(self, member: Member, wait_s: float) -> None:
         """Wait until the member may start. Raises OperationRejected or HeartbeatTimeout if it must not start."""
         before = self._orders_before.get(member.name) or self._orders_of(member)
-        is_overruled = (self._moves_members or self._kind is ActionKind.ARMS) and (
-            # A landing without a delay is sent even if there is a newer action, because that action may fail.
+        is_checked_at_once = self._moves_members or self._kind is ActionKind.ARMS
+        # A landing without a delay is sent even if there is a newer action, because that action may fail.
+        is_overruled = is_checked_at_once and (
             self._has_order_since(member, before) or (not self._ends_flight and self._has_newer_action(member))
         )
         while wait_s > START_TOLERANCE_S and not is_overruled:
             await self._wait(member, wait_s)
             is_overruled = self._has_order_since(member, before) or self._has_newer_action(member)
-            # After a blocked event loop, the delays of several members may end at once. Each of them then waits
-            # until `stagger_s` after the last start.
+            # After a blocked event loop, the delays of several members may end at once. Each member then waits until
+            # `stagger_s` after the last start.
             wait_s = self._last_start_at + self._stagger_s - self._context.now()
         if is_overruled:
             raise OperationRejected(
@@ -274,7 +275,7 @@ class FleetAction:
 
     def _has_newer_order(self, member: Member) -> bool:
         """Return True if a newer action moves the member, or the program has told it to land or return."""
-        # If the action is a function of the program that still runs, the landing may be a part of the action.
+        # While a function of the program runs as this action, it may itself have ordered the landing.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
         return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
 
@@ -298,7 +299,7 @@ class FleetAction:
         return _SentOrders(_newest_order(member), commands)
 
     def _has_order_since(self, member: Member, before: _SentOrders) -> bool:
-        """Return True if the program has since ordered to land, return or disarm or, if this action arms, to arm."""
+        """Return True if, since then, the program has told the member to land, return, disarm or, if we arm it, arm."""
         newest, command_count = self._orders_of(member)
         must_land = newest is not before.newest and _is_ending_flight(member)
         # A command to disarm does not prevent a landing, because a vehicle in the air refuses to disarm.
@@ -435,8 +436,10 @@ class FleetAction:
         )
 
     def _hold_finished_members(self) -> None:
+        if self._kind not in (ActionKind.MOVES, ActionKind.OTHER):
+            return
         # Members that still execute the action hold when it is cancelled. Members that have finished it need an order.
-        for member in self._members if self._kind in (ActionKind.MOVES, ActionKind.OTHER) else ():
+        for member in self._members:
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
             if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
                 self._context.hold(member, f"aerokit hold {member.name}")
@@ -496,7 +499,7 @@ class FleetContext:
         self.is_closed = True
         for member in self.members.values():
             member.stop_monitoring()
-        for action in tuple(self.actions):  # Otherwise they continue with vehicles that stay connected.
+        for action in tuple(self.actions):  # Otherwise actions continue with vehicles that stay connected.
             action.close()
         await self.background.aclose()
 

@@ -72,7 +72,7 @@ class Selection(Actions, Missions, Formations, Shows):
 
 @checks_arguments
 class Fleet(Selection):
-    """A fleet with all its members. :func:`aerokit.fleet` yields it, and it is usable in the block only."""
+    """A fleet with all its members. :func:`aerokit.fleet` yields the fleet; it can be used only inside the block."""
 
     def __init__(self, context: FleetContext) -> None:
         super().__init__(context, None)

@@ -73,9 +73,9 @@ class Member:
 
     @property
     def is_flown_by_program(self) -> bool:
-        """True while the member flies by an order of this program.
+        """True while the member flies because this program ordered it to.
 
-        Failure policies and the distance monitor send orders to such members only.
+        Failure policies and the distance monitor send orders only to members for which this is True.
         """
         return self.is_available and self.vehicle.is_flown_by_program
 

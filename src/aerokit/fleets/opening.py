@@ -223,7 +223,8 @@ class _Discovery:
     """Finds the system ids to connect to, by network: the requested ones, or all found that have no vehicle object yet.
 
     ``requested`` maps networks to system ids, or to None for all. ``count`` is the total number of vehicles to wait
-    for, with the ``passed_count`` vehicles that the program passed to ``fleet()``; None: at least one on each network.
+    for; None: at least one on each network. The count includes the ``passed_count`` vehicles that the program passed to
+    ``fleet()``.
     """
 
     def __init__(
@@ -371,8 +372,8 @@ class MemberConnections:
         self._has_block_failed = error is not None
         self._close.set()
         # If a task is still connecting, opening has failed, and cancelling all tasks is enough.
-        is_no_task_connecting = len(self._connected) == self._running_task_count
-        if self._running_task_count and is_no_task_connecting:
+        are_all_connected = len(self._connected) == self._running_task_count
+        if self._running_task_count and are_all_connected:
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 

@@ -210,9 +210,9 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
 def _closest_inside(
     start_difference: Sequence[float], vector: Sequence[float], other_vector: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return how far along two legs, from 0 to 1, the lines through them are closest to each other.
+    """Return the closest points of the lines through two legs, each as a fraction of its leg, 0 to 1.
 
-    Returns None if the lines are closest beyond the end of a leg, or if they are parallel.
+    Returns None if one of the points is beyond the ends of its leg, or if the lines are parallel.
     """
     # Dot products of a (`vector`), b (`other_vector`) and d (`start_difference`).
     aa, bb = _dot(vector, vector), _dot(other_vector, other_vector)
@@ -248,7 +248,7 @@ def _closest_on_edge(
     difference: Sequence[float],
     other_difference: Sequence[float],
 ) -> tuple[float, float]:
-    """Return the point on one edge of the polygon in `_closest` at which two legs are closest.
+    """Return where two legs are closest, among the points (s, t) of one edge of the polygon in `_closest`.
 
     ``difference`` and ``other_difference`` are the vectors between the legs at the two corners.
     """

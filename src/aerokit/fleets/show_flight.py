@@ -116,7 +116,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
     try:
         for _ in range(requests):
             now = connection.now()
-            timestamp = int(now * 1e9) | 1  # odd, so that it usually differs from the link's own requests
+            timestamp = int(now * 1e9) | 1  # odd, so that it usually differs from that of a `LinkProbes` request
             sent_at_by_timestamp[timestamp] = now
             connection.send(Timesync(tc1=0, ts1=timestamp), to=vehicle.system_id)
             await anyio.sleep(TIMESYNC_INTERVAL_S)
@@ -419,7 +419,7 @@ class Shows(Travel):
         conflicts = [
             conflict
             for conflict in find_conflicts(paths, min_m, slack_s=CONFLICT_SLACK_S)
-            if conflict.name not in stationary  # two members that both stay where they are
+            if conflict.name not in stationary  # Otherwise both members stay where they are.
         ]
         if conflicts:
             conflict = conflicts[0]

@@ -89,8 +89,8 @@ class Travel(SelectionBase):
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         positions = self._resolve_targets(targets)
-        # A function is called for available members only. `names` has all members, so that the result lists unavailable
-        # members as skipped.
+        # If `targets` is a function, it was called for available members only. `names` then has all members, so that
+        # the result lists unavailable members as skipped.
         names = tuple(self.members) if callable(targets) else tuple(positions)
         for name, target in positions.items():
             self.members[name].vehicle._position.check_reach(f"targets[{name!r}]", [target], max_distance_m)
@@ -227,7 +227,7 @@ class Travel(SelectionBase):
         moving = [members[name] for name in targets if members[name].is_available]
         if not moving:
             return [], {}
-        origin = LocalOrigin(targets[moving[0].name])  # It stays the same while the members move.
+        origin = LocalOrigin(targets[moving[0].name])  # The targets stay the same while the members move.
         routes = [
             Route(
                 member.name,

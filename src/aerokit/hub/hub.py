@@ -160,9 +160,8 @@ class Hub:
         self._raise_unless_open()
         connection.raise_if_ended()
         links = [attachment.link for attachment in self._attachments.values() if attachment.is_open]
-        if name not in self._attachments and any(
-            isinstance(link, SharedLink) and link.connection is connection for link in links
-        ):
+        is_shared = any(isinstance(link, SharedLink) and link.connection is connection for link in links)
+        if is_shared and name not in self._attachments:
             # Each of two endpoints would send the vehicle what the other one receives from it.
             raise InvalidArgument("connection = … is not allowed: this hub shares it already")
         return (await self._add(Endpoint(SharedLink(connection), name=name))).statistics()

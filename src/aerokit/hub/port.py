@@ -265,22 +265,22 @@ class Port:
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def passes_rate_limit(self, key: int, period_s: float, now: float) -> bool:
-        """Return True if the rate limit allows a frame now. Otherwise count it as dropped.
+        """Return True if the rate limit allows a frame now. Otherwise count the frame as dropped.
 
         ``key`` identifies the sender and the message.
         """
-        due = self._due.get(key)
-        if due is not None and now < due:
+        due_at = self._due.get(key)
+        if due_at is not None and now < due_at:
             self.counters.dropped["rate_limited"] += 1
             return False
-        if due is None:
+        if due_at is None:
             if len(self._due) >= MAX_RATE_LIMITS:
                 self._due.clear()  # This bounds the memory. Each message may then be sent once too early.
             self._due[key] = now + period_s
         else:
-            # The next due time is counted from the last one rather than from now, so that irregular messages reach the
-            # allowed average rate. The next due time is never before now, so that no burst follows a pause.
-            self._due[key] = max(due, now - period_s) + period_s
+            # The next due time is counted from the previous due time rather than from now, so that irregular messages
+            # reach the allowed average rate. It is never before now, so that no burst follows a pause.
+            self._due[key] = max(due_at, now - period_s) + period_s
         return True
 
     def flush(self, unix_time: float) -> None:

@@ -139,9 +139,9 @@ class Router(Generic[PortT]):
         self.on_autopilot: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, the port of the frame, and the port at which it came before.
+        """Called with the kind of event, the sender, the port of the frame, and another port that received the sender.
 
-        The last one is None if that port was removed since.
+        The other port is None if it was removed since.
         """
 
     def add(self, port: PortT) -> Ingress[PortT]:
@@ -193,8 +193,8 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # If an earlier frame with this identity arrived at the same port (item 0 of its record), this frame is
-                # no copy: its sequence number and checksum are equal by chance.
+                # Item 0 of a record is a port number. A frame is no copy of an earlier frame from the same port: their
+                # sequence numbers and checksums are equal by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == port_number:
                     newer[identity] = record
                     plan.sender.received_at = now
@@ -311,16 +311,15 @@ class Router(Generic[PortT]):
         """Count a returning frame. Return True while a loop is proven."""
         count = min(ingress.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
         ingress.echoes[source] = count
-        was_proven = now < ingress.loop_until
-        if count < MIN_LOOP_FRAMES and not was_proven:
-            return False
-        if not was_proven:
+        if now >= ingress.loop_until:  # No loop is known at this port.
+            if count < MIN_LOOP_FRAMES:
+                return False
             self._report("loop", source, ingress, first_port)
         ingress.loop_until = now + LOOP_WINDOW_S
         return True
 
     def _record_new_frame(self, ingress: Ingress[PortT], source: int) -> None:
-        # A new frame is no echo.
+        # Each new frame cancels a returning frame in the count, so that single echoes do not count as a loop.
         count = ingress.echoes.pop(source, 0) - 1
         if count > 0:
             ingress.echoes[source] = count
@@ -422,7 +421,7 @@ class Router(Generic[PortT]):
         return numbers
 
     def _is_redundant(self, number: int, sender: Sender) -> bool:
-        """Return True if all autopilots at this port get the command of ``sender`` through another port, or sent it."""
+        """Return True if this port has autopilots, and one is the sender or all get commands through other ports."""
         here = [autopilot for autopilot in self._senders.values() if autopilot.is_autopilot and autopilot.is_at(number)]
         return sender in here or (bool(here) and all(autopilot.port_number != number for autopilot in here))
 

@@ -83,7 +83,7 @@ class Sender:
         return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if this is the sender's port, or if its frames arrive at both ports."""
+        """Return True if port ``number`` is the sender's port, or if the sender's frames arrive at both ports."""
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:
@@ -126,7 +126,7 @@ FrameRecord = tuple[int, int, float]
 
 
 class RecentFrames:
-    """Recent frames in two tables. Each `LOOP_WINDOW_S`, the older one is dropped as a whole, without a search."""
+    """Recent frames in two tables. Every `LOOP_WINDOW_S`, the older table is dropped as a whole, without a search."""
 
     __slots__ = ("newer", "older", "rotate_at")
 
@@ -168,7 +168,7 @@ class IdentityGuard:
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
         """Return True if this peer may send this frame.
 
-        Call it for heartbeats, and for every frame if there are several peers.
+        Must be called for every heartbeat and, if there are several peers, for every other frame, too.
         """
         if self._routes.arrived_on_other_peer(frame, peer):
             self._current_peer = peer

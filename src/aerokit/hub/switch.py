@@ -111,7 +111,7 @@ class Switch:
     ) -> None:
         """Forward frames received at a port.
 
-        ``data`` is the received bytes. It is None if some of the bytes do not belong to the frames.
+        ``data`` has the received bytes; None if they are not exactly the bytes of these frames.
         """
         # Hot path: local variables are faster than attributes.
         ingress, guard, peer = port.ingress, port.guard, port.peer
@@ -186,7 +186,7 @@ class Switch:
         return remaining
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
-        """Forward ``data`` in one write and return True, or return False if that is not possible."""
+        """Forward ``data`` in one write, if all ports permit it. Return True if the data was forwarded."""
         outs = plans[0].outs
         for plan in plans:
             if plan.outs is not outs or not plan.is_plain:

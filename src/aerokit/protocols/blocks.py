@@ -199,11 +199,11 @@ class BlockRequests:
         block.sent_at = now
         self._in_flight[offset] = block
 
-    def _requeue_lost(self, number: int) -> None:
+    def _requeue_lost(self, answered_number: int) -> None:
         lost = []
         for offset, block in self._in_flight.items():
-            if block.transmission_number > number - LOSS_THRESHOLD:
-                break
+            if block.transmission_number > answered_number - LOSS_THRESHOLD:
+                break  # All further blocks were requested later.
             lost.append(offset)
         self._requeue(lost)
 

@@ -33,7 +33,7 @@ MAX_ATTEMPTS = 4
 
 
 class Repetition(NamedTuple):
-    """Further effect of a repeated command. With ``param`` (1 to 7), only if this parameter has this value."""
+    """Further effect of a repeated command. If ``param`` (1 to 7) is given, only if that parameter equals ``value``."""
 
     effect: str
     param: int | None = None
@@ -80,7 +80,8 @@ def allowed_attempts(command: int, params: Sequence[float]) -> int:
     repetition = UNREPEATABLE_COMMANDS.get(command)
     if repetition is None:
         return MAX_ATTEMPTS
-    return 1 if repetition.param is None or params[repetition.param - 1] == repetition.value else MAX_ATTEMPTS
+    has_effect = repetition.param is None or params[repetition.param - 1] == repetition.value
+    return 1 if has_effect else MAX_ATTEMPTS
 
 
 BROADCAST = 0
@@ -89,7 +90,7 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# Interval of the checks for a new HEARTBEAT, after which a command with an `OrderStatus` may be repeated.
+# A command with an `OrderStatus` is repeated only after a new HEARTBEAT. We check for one at this interval.
 POLL_INTERVAL_S = 0.05
 
 MAX_HEARTBEAT_AGE_S = 2.5
@@ -172,9 +173,9 @@ def command_int(
 class CommandExchange(Exchange[CommandAck]):
     """Sends one command, and repeats it until it is acknowledged. The result is the COMMAND_ACK with ACCEPTED.
 
-    Without an ``order_status``, the command is repeated every ``attempt_timeout`` seconds. With an ``order_status``, it
-    is repeated only after a new HEARTBEAT, so never to a silent vehicle, and no longer once ``order_status.end`` has a
-    text.
+    Without an ``order_status``, the command is repeated every ``attempt_timeout`` seconds. With an ``order_status``,
+    each repetition waits for a new HEARTBEAT, so a silent vehicle gets none. Once ``order_status.end`` has a text, the
+    command is not repeated any more.
 
     Acknowledgements to other ground stations, or from other components than the target, are ignored.
 
@@ -260,7 +261,7 @@ class CommandExchange(Exchange[CommandAck]):
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
         # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
-        # command is repeated. A command with a single attempt ignores none, because its own may be the only one.
+        # command is repeated. A command with a single attempt ignores none, because it may get only one.
         may_ignore = self._transmitted_count == 1 and self._attempts > 1
         is_to_earlier_command = not self._transmitted_count or (may_ignore and self.answers < self._earlier_answers)
         if message.result != MavResult.IN_PROGRESS:
@@ -327,8 +328,8 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        # From the earlier deadline on, `_expire_order` checks whether the command may be repeated.
         if self._order_status is not None:
+            # From this deadline on, `_expire_order` checks whether the command may be repeated.
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 

@@ -57,7 +57,7 @@ class Exchange(ABC, Generic[ResultT]):
 
     @abstractmethod
     def expire(self, now: float) -> None:
-        """Send again, or fail, because the deadline has passed. Not called any more once ``done`` is True."""
+        """Send again or fail. Called when the deadline has passed, unless ``done`` is True."""
 
     def link_changed(self, now: float) -> None:
         """Called after a switch to another link, which leads to another port of the vehicle.
@@ -204,7 +204,7 @@ class MessageStream:
     def on_message(self, now: float, messages: int) -> None:
         """Record a message. ``messages`` is the number sent since the previous message, including lost ones.
 
-        It is 0 or less for a repeated or delayed message. The time before such a message is not measured.
+        For a repeated or delayed message, ``messages`` is 0 or less. The time before such a message is not measured.
         """
         elapsed_s = now - self._last_at
         if self._has_started and messages > 0:
@@ -301,7 +301,7 @@ class Transfer(Exchange[ResultT]):
         self.round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip
         self._idle_timeout_s = idle_timeout_s
         self.on_progress: OnProgress | None = on_progress
-        """Called with each progress report. It must not raise, because the next request is sent only after it."""
+        """Called with each progress report. Must not raise, because the next request is sent only after this call."""
 
     def _start_clock(self, now: float) -> None:
         self._started_at = now

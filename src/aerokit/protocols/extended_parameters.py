@@ -138,10 +138,10 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
 class SettingReads(NamedReads[Setting]):
     """Read some settings by name. The result has one answer for each name, in the order given.
 
-    Components do not answer requests for unknown names. If a name is not answered in time, the setting with index 0,
-    which always exists, is therefore requested as well. If it is answered, but the name repeatedly is not, the result
-    for the name is a ParameterRejected. After ``idle_timeout_s`` seconds without progress, the missing answers become
-    ParameterTimeout errors.
+    Components do not answer requests for unknown names. After a time-out for a name, the setting with index 0, which
+    always exists, is therefore requested as well. If the component sends that setting but repeatedly ignores the name,
+    the result for the name is a ParameterRejected. After ``idle_timeout_s`` seconds without progress, the missing
+    answers become ParameterTimeout errors.
     """
 
     expects: tuple[type[Message], ...] = (ParamExtValue,)
@@ -177,7 +177,7 @@ class SettingWrite(Transfer[Setting]):
     """Set one setting. The result is the setting as the component reports it afterwards.
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
-    answer arrives, the value is read. The next step depends on it:
+    answer arrives, the value is read. The next step depends on the value that the component reports:
 
     - The requested value: the write is complete.
     - The old value (``before``): PARAM_EXT_SET is sent again, because it may have been lost. The write fails if the
@@ -230,7 +230,7 @@ class SettingWrite(Transfer[Setting]):
         elif settings_equal(reported.value, self._value):
             self._measure(now)
             self._finish(reported)
-        elif not self._is_writing and not self._is_stale(now):  # While it writes, a component reports the old value.
+        elif not self._is_writing and not self._is_stale(now):  # A component reports the old value while it writes.
             self._measure(now)
             self._on_unexpected_value(reported, now)
 

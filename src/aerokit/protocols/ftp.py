@@ -243,7 +243,7 @@ class FtpClient:
     def next_sequence(self, replies: int = 1) -> int:
         """Return the sequence number of a new request.
 
-        Its replies have the next ``replies`` numbers. The request after it has the same number as the last reply.
+        The replies have the next ``replies`` numbers. The next request has the same number as the last reply.
         """
         sequence = self._sequence % SEQUENCE_COUNT
         self._sequence = sequence + replies
@@ -309,7 +309,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     attempts: int
 
-    # start() sets these attributes.
+    # start() sets this attribute.
     _sent_at: float
 
     def __init__(
@@ -410,8 +410,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _is_already_done(self, reply: FtpMessage) -> bool:
         opcode = self._request.opcode
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            # ArduPilot and PX4 refuse to close a session only if it is not open. PX4 has several errors for this; see
-            # `NO_SESSION_ERRORS`.
+            # A refusal means that the session is not open. PX4 has several errors for this; see `NO_SESSION_ERRORS`.
             return True
         if self.attempts == 1:
             return False

@@ -48,11 +48,11 @@ SHORT_FILE = 20 * DATA_SIZE  # If a file has at most this many bytes, repeating 
 MAX_REPEATED_BURSTS = 3
 # Maximum number of remembered bursts. Blocks of earlier bursts may still arrive.
 MAX_BURSTS = 32
-# A block that is this many bytes or more beyond all others is ignored. Sequence numbers wrap around, so they do not
-# prove that it belongs to the burst.
+# A block that is this many bytes or more beyond all others is ignored. Its sequence number does not prove that the
+# block belongs to the burst, because sequence numbers wrap around.
 MAX_BLOCK_DISTANCE = SEQUENCE_COUNT // 2 * DATA_SIZE
-# A burst counts as ended if no block arrives in the time of this many blocks: before its first block, and after it.
-# Radios hardly ever lose so many blocks in a row.
+# A burst counts as ended if no block arrives in the time that this many blocks usually take. The first number applies
+# until the burst's first block arrives, the second one afterwards. Radios hardly ever lose so many blocks in a row.
 MAX_LOST_FIRST_BLOCKS, MAX_LOST_BLOCKS = 4, 10
 
 
@@ -76,7 +76,7 @@ class _Burst:
     def __init__(self, sequence: int, offset: int, sent_at: float) -> None:
         self.sequence, self.offset, self.sent_at = sequence, offset, sent_at
         self.highest_block = -1  # number of the block with the largest offset; -1 before the first block
-        self.highest_at = sent_at  # time at which it arrived
+        self.highest_at = sent_at  # time at which that block arrived; before it, the time of the request
 
     def blocks_before(self, reply: FtpMessage) -> int:
         return (reply.sequence - self.sequence - 1) % SEQUENCE_COUNT
@@ -127,7 +127,7 @@ class FtpDownload(FtpExchange[int]):
         self._bursts: deque[_Burst] = deque(maxlen=MAX_BURSTS)
         self._is_bursting = False
         self._failed_bursts = 0
-        self._bursts_without_new_block = 0  # number of bursts requested since a missing block was received
+        self._bursts_without_new_block = 0  # number of bursts requested since the last new block arrived
         self._supports_bursts = True
         self._burst_active_at = 0.0  # time of the latest burst request or block of a burst
         self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
@@ -141,8 +141,7 @@ class FtpDownload(FtpExchange[int]):
         if self._is_idle(now):
             self._fail(self._timeout_error())
             return
-        # The burst has ended, or its request was lost.
-        if self._is_bursting and now >= self._next_block_deadline:
+        if self._is_bursting and now >= self._next_block_deadline:  # The burst has ended, or its request was lost.
             self._is_bursting = False
             self._failed_bursts += 1
         self._proceed(now)
@@ -200,7 +199,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
-        # In a round trip, the server can send this many blocks, so this many requests in flight do not have to queue.
+        # The server can send this many blocks in one round trip, so this many requests in flight need not queue.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
@@ -308,7 +307,7 @@ class FtpDownload(FtpExchange[int]):
         # Maximum number of full blocks in the burst. If the size is unknown, ArduPilot's burst length is assumed.
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # Later requests must not have the numbers of this burst, because the server could take them for repetitions.
-        # Besides the full blocks, the request, a shorter last block and the NAK have a number each.
+        # The request, a shorter last block and the NAK need one number each, too.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True

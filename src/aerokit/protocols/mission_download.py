@@ -34,10 +34,10 @@ MIN_ROUND_TRIP_FRACTION = 0.8
 
 
 class DownloadResult(Snapshot):
-    """Result of a download: the items, their total number on the vehicle, and the plan's ``opaque_id``.
+    """Result of a download.
 
-    ``count`` is larger than the number of items if only some items were requested. ``opaque_id`` is 0 if the vehicle
-    sends none.
+    ``count`` is the number of items on the vehicle. If only some items were requested, ``items`` has fewer.
+    ``opaque_id`` identifies the plan on the vehicle; 0 if the vehicle sends none.
     """
 
     items: tuple[Item, ...]

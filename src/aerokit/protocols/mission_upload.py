@@ -62,7 +62,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
 
-    # start() sets these attributes.
+    # start() sets this attribute.
     _received_at: float
     # The first request sets this attribute.
     _as_float: bool
@@ -206,8 +206,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
             if self._is_requesting and self._sent_end == self._end:
-                # The last item may be sent before the vehicle requests it. Until then, an ACCEPTED may be a delayed
-                # answer to an earlier upload.
+                # We may send the last item before the vehicle requests it. Until the vehicle does, an ACCEPTED may be a
+                # delayed answer to an earlier upload.
                 was_last_requested = self._confirmed_end == self._end - 1
                 is_confirmed = was_last_requested and not self._was_tail_repeated
                 self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
@@ -240,7 +240,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             seq = self._end - 1 if are_all_sent else self._confirmed_end
             self._send(seq, now, unless_in_flight=True)
             self._wait(now)
-        elif now - self._error_at >= self._in_flight_s:  # An earlier ERROR may answer a message before the repetition.
+        elif now - self._error_at >= self._in_flight_s:  # A sooner ERROR may answer what we sent before the repetition.
             if self._sent_end == self._end:
                 # All items were sent, so the upload may be complete. The caller must read the plan back.
                 self._succeed(now, is_confirmed=False, opaque_id=0)
@@ -257,7 +257,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, result: int, now: float) -> None:
-        """Begin again. ``result`` is the MAV_MISSION_RESULT to fail with if that is not possible."""
+        """Begin again or, if the upload must not begin again, fail with ``result`` (a MAV_MISSION_RESULT)."""
         if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
             return
         # A partial upload does not begin again, because another station may have changed the vehicle's plan since.

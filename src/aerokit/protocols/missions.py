@@ -130,8 +130,8 @@ class MissionExchange(Transfer[ResultT]):
         return self.round_trip.timeout_s(backoff_attempt)
 
     def _reject(self, result: int, *, seq: int | None = None) -> None:
-        is_item = seq is not None and seq >= self.offset  # an item before the offset is home
-        item = seq - self.offset if seq is not None and is_item else None
+        # An index before the offset is the home position, which is no item of the caller.
+        item = None if seq is None or seq < self.offset else seq - self.offset
         subject = "" if item is None else f" item {item}"
         reason = RESULTS.get(result, f"result {result}")
         self._fail(MissionRejected(f"{self.kind}: the vehicle refused{subject}: {reason}", result=result, item=item))
@@ -151,9 +151,7 @@ class MissionClear(MissionExchange[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process the MISSION_ACK. OPERATION_CANCELLED and INVALID_SEQUENCE are ignored: they answer an earlier upload.
-
-        ERROR may answer a late item of an earlier upload, so the request is repeated once.
+        """Process the MISSION_ACK.
 
         A late ACCEPTED of an earlier upload looks like the answer to this request and is accepted. The caller therefore
         reads the number of items afterwards.
@@ -165,10 +163,12 @@ class MissionClear(MissionExchange[None]):
                 self.round_trip.add_sample(now - self._sent_at)
             self._finish(None)
         elif message.type == MavMissionResult.ERROR and not self._has_error:
+            # This ERROR may answer a late item of an earlier upload, so the request is repeated once.
             self._has_error = True
             self._repeat(now)
         elif message.type == MavMissionResult.ERROR and now - self._sent_at < (self.round_trip.fastest_s or 0.0) / 2:
-            return  # It is too early to answer the repetition.
+            return  # This ERROR is too early to answer the repetition.
+        # OPERATION_CANCELLED and INVALID_SEQUENCE answer an earlier upload, so they are ignored.
         elif message.type not in (MavMissionResult.OPERATION_CANCELLED, MavMissionResult.INVALID_SEQUENCE):
             self._reject(message.type)
 
@@ -212,7 +212,7 @@ class SetCurrentItem(Transfer[None]):
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
 
-    # start() sets these attributes.
+    # start() sets this attribute.
     _sent_at: float
 
     def __init__(

@@ -35,8 +35,8 @@ BY_NAME = -1
 PROBE, PROBE_INDEX = "", 0
 # A name without an answer counts as unknown once the probability that all its answers were lost is below this value.
 MAX_LOSS_PROBABILITY = 1e-4
-# An unexpected value is the result of a write after MIN_EQUAL_ANSWERS. The value from before the write needs more,
-# because the vehicle may have sent some of them before the write arrived.
+# After MIN_EQUAL_ANSWERS with the same unexpected value, this value is the result of the write. The value from before
+# the write needs MIN_UNCHANGED_ANSWERS, because the vehicle may have sent some answers before the write arrived.
 MIN_EQUAL_ANSWERS, MIN_UNCHANGED_ANSWERS = 2, 8
 
 
@@ -51,7 +51,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         super().__init__(target_system, target_component, **options)
         self._window: RequestWindow[int] = RequestWindow(self.round_trip, size=self.window_size)
         self._received: dict[int, ValueT] = {}  # the values by index
-        self._reported_counts: dict[int, int] = {}  # by index: the count in the message that had the value
+        self._reported_counts: dict[int, int] = {}  # by index: the number of values that the message reported
         self._count: int | None = None
         self._next_index = 0  # next index that is expected in the stream
         self._is_streaming = False
@@ -108,7 +108,10 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self.deadline: float | None = min(at for at in times if at is not None)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
-        """Drop values received with another count, at most `MAX_REFRESHES` times. Return their indices."""
+        """Drop the values that were reported with another count, and return their indices.
+
+        After `MAX_REFRESHES` such calls, the values are kept, and the result is empty.
+        """
         stale = tuple(index for index in range(count) if self._reported_counts[index] != count)
         if not stale or self._refreshes >= MAX_REFRESHES:
             return ()
@@ -208,7 +211,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 class NamedReads(NamedRequests[ValueT]):
     """Read some values by name, and detect unknown names by a probe, a request that is always answered.
 
-    If the component answers the probe, but a name repeatedly not, the result for the name is a ParameterRejected.
+    If the component answers the probe but repeatedly ignores a name, the result for the name is a ParameterRejected.
     """
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
@@ -275,7 +278,7 @@ class RepeatedAnswers(Generic[ValueT]):
     def are_conclusive(self, *, is_unchanged: bool) -> bool:
         """Return True if the answers suffice to end the write.
 
-        ``is_unchanged`` is True if they have the value from before the write.
+        ``is_unchanged`` is True if the answers have the value from before the write.
         """
         needed = MIN_UNCHANGED_ANSWERS if is_unchanged else MIN_EQUAL_ANSWERS
         return len(self._answers) >= needed

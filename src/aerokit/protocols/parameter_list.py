@@ -109,14 +109,14 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._on_value_without_index(message, now)
             return
         is_streamed = self._is_streaming and index >= self._next_index
-        is_requested = index in self._window  # Otherwise it answers a request of others, which delays nothing.
+        is_requested = index in self._window  # A value that is neither streamed nor requested answers another station.
         self._record_count(message.param_count, is_streamed=is_streamed)
         if is_streamed:
             self._on_streamed_value(index, now)
         else:
             self._window.on_answer(index, now)
-        # A value that we have requested delays the stream, so it also restarts the stream's time-out. Near the end of
-        # the list, only streamed values do, so that the last missing values are requested early.
+        # The answer to a request delays the stream, so it also restarts the stream's time-out. Near the end of the
+        # list it does not, so that the last missing values are requested early.
         if self._is_streaming and (is_streamed or (is_requested and not self._is_near_end)):
             self._stream_deadline = now + self._stream_timeout_s()
         parameter = parameter_of(message, self._bytewise)

@@ -94,8 +94,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
 
     Args:
         probe: True to detect unknown names, which ArduPilot, and PX4 before 1.17, do not answer. The parameter with
-            index 0 is then requested too. A vehicle that answers this request but not those for a name has no parameter
-            of that name: its result is a ParameterRejected without a code.
+            index 0 is then requested too. If the vehicle answers this request but none for a name, the result for that
+            name is a ParameterRejected without a code.
         possibly_stale: maps a name to its old value, which a delayed message may still report. If an answer has this
             value, the parameter is read once more.
         alternatives: maps a name to other names of the same parameter. Once one name is answered, the results for the
@@ -157,7 +157,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # Read it once more, because a delayed message may have had the old value.
+                self._window.request(name)  # A delayed message may have had the old value, so we read once more.
             else:
                 self._set_result(name, reported, now)
                 self._reject_alternatives(name, now)
@@ -194,8 +194,8 @@ class ParameterWrites(ParameterRequests):
     - The requested value with the requested type: the write is complete.
     - No answer: the value is read.
     - The old value: PARAM_SET is sent again, because it may have been lost. If the vehicle reports the old value eight
-      times in a row, and still after a second, it is the result. While the old value is unknown, every other value is
-      treated like this.
+      times in a row, and still after a second, it is the result. While the old value is unknown, every unexpected value
+      is treated like the old value.
     - Another value: the value is read again. PARAM_SET is not sent again, because it would undo the change if another
       station has set the value. A value reported twice in a row is the result.
 

@@ -17,8 +17,8 @@ DEFAULT_SIZE = 20
 MAX_GROWTH = 5
 # An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
-# The last FEW_LEFT requests are sent twice at each attempt from number DUPLICATE_FROM_ATTEMPT on. Otherwise a transfer
-# over a bad radio would wait long for them.
+# From attempt DUPLICATE_FROM_ATTEMPT on, each of the last FEW_LEFT requests is sent twice. Otherwise a transfer over a
+# bad radio would wait long for their answers.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
 # Maximum time-out of the last few requests, unless two round trips are longer. Repeating them costs little.
 FEW_LEFT_TIMEOUT_S = 0.5
@@ -30,7 +30,7 @@ LOSS_THRESHOLD = 3
 
 
 class _Request:
-    """A request's first and latest transmission: their times, and their numbers, counted over all requests."""
+    """Times and numbers of a request's first and latest transmission. All requests share one count of transmissions."""
 
     __slots__ = ("attempts", "due_at", "first_at", "first_number", "last_number", "sent_at", "was_duplicated")
 
@@ -49,7 +49,7 @@ class RequestWindow(Generic[KeyT]):
 
     The limit is ``size`` at first, and grows while answers do not become slower. A request is repeated when its answer
     is overdue (:class:`RoundTrip`), or when later requests were answered first. With ``duplicate_last``, the last few
-    requests are sent twice at each attempt from the third on.
+    requests are sent twice from their third attempt on.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:
@@ -104,7 +104,8 @@ class RequestWindow(Generic[KeyT]):
     def on_answer(self, key: KeyT, now: float, *, loss_threshold: int = LOSS_THRESHOLD) -> list[KeyT]:
         """Record an answer. Requeue the requests that are presumed lost, and return them.
 
-        Lost are requests that were last sent at least ``loss_threshold`` transmissions before the answered one.
+        A request is presumed lost if it was last sent at least ``loss_threshold`` transmissions before the answered
+        request.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)

@@ -524,7 +524,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
 
 class Fleet(FleetTwin, Selection):
-    """A fleet with all its members. :func:`aerokit.fleet` yields it, and it is usable in the block only."""
+    """A fleet with all its members. :func:`aerokit.fleet` yields the fleet; it can be used only inside the block."""
 
     def reclaim(self, name: str) -> None:
         """Make members available again after they were taken over or released.

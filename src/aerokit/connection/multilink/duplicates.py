@@ -71,7 +71,7 @@ class Copies:
         self.current: ReceivedFrame = ReceivedFrame(-math.inf, 0, 0, is_other_peer=True)
         """Record of the last frame that was passed to :meth:`record`."""
         self.may_be_late_copy: bool = False
-        """True if this frame may be a copy of one that was delivered over another link some seconds ago."""
+        """True if the last frame may be a copy of a frame that was delivered over another link some seconds ago."""
 
     def record(self, frame: Frame, link: int, *, is_other_peer: bool = False) -> bool:
         """Record a frame. Return True if it is a copy: an equal frame arrived recently, but only over other links.

@@ -182,7 +182,8 @@ MIN_BETTER_S = 3.0
 
 JITTER_S = 0.05
 
-# A switch waits until no command is in transit, but at most this time, because set-points may be sent continuously.
+# A switch of the link waits until no command is in transit, but not longer than this. A continuous stream of set-points
+# would otherwise prevent it.
 MAX_SWITCH_DELAY_S = 10.0
 
 
@@ -200,8 +201,8 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, received over the link that was in use then."""
-        # Index of the link that delivered `hardware`, or over which a later reboot was detected; None if there is none.
-        # The next id over this link replaces `hardware` even if it differs.
+        # Index of the link whose next hardware id replaces `hardware` even if the two differ. This is the link that
+        # delivered `hardware` or, after a reboot, the link over which the reboot was detected. None at first.
         self._hardware_link: int | None = None
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
@@ -340,7 +341,7 @@ class LinkChoice:
     def _change(self, chosen: Candidate, reason: str, now: float) -> str:
         previous = self.used
         if previous is not None:
-            # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.
+            # Until `fresh_after`, the new link may deliver telemetry that is older than the previous link's last frame.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
             self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
             # The chosen link was compared with the previous one (see `may_be_used`). Both therefore lead to the same

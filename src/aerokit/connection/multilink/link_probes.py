@@ -139,7 +139,7 @@ class LinkProbes:
         return True
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
-        """Return the seconds since the probe. None if it was sent to another system or over another link."""
+        """Return the seconds from the probe to its answer, or None if another system or another link answered."""
         probe = self._pending[answer.ts1]
         if (probe.system_id, probe.link) != (system_id, link):
             return None

@@ -66,7 +66,7 @@ class _Pictures:
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
-        self._last_single: tuple[ComponentIds, int] | None = None  # sender and sequence number of a single image
+        self._last_single: tuple[ComponentIds, int] | None = None  # sender and sequence number of the last single image
 
     async def start(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures

@@ -161,7 +161,7 @@ UNKNOWN_PROGRESS = 255
 
 
 RESULT_MAX_AGE_S = 5.0
-"""For this time after its end, a repeated command is answered with the same result instead of being executed again."""
+"""For this time after a command has ended, a repetition gets the same result, and is not executed again."""
 MAX_RESULTS = 256
 """Maximum number of stored results. If there are more, the oldest is forgotten."""
 
@@ -207,7 +207,7 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # The last command that has ended, by MAV_CMD and sender. The command that ended last is the last entry.
+        # By MAV_CMD and sender: the command that ended last. Entries have the order in which their commands ended.
         self._ended: dict[tuple[int, ComponentIds], EndedCommand] = {}
         host.on(CommandCancel, self._on_cancel)
 
@@ -248,7 +248,7 @@ class RunningCommands:
         if not running.cancel():
             self._running[command.command] = running
             return False
-        # If both commands have the same sender, it would take CANCELLED for the answer to `command`.
+        # A sender of both commands would take CANCELLED for the answer to `command`.
         if running.command.sender != command.sender:
             self._server.answer(running.command, MavResult.CANCELLED)
         return True

@@ -18,8 +18,8 @@ _ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "
 class DefinedParameterServer(ExtendedParameterServer):
     """Settings that a camera definition defines.
 
-    Write-only settings are not listed. A value that the definition does not allow is answered with VALUE_UNSUPPORTED,
-    a change of a read-only or excluded setting with FAILED.
+    Write-only settings are not listed. The answer to a value that the definition does not allow is VALUE_UNSUPPORTED.
+    The answer to a change of a read-only or excluded setting is FAILED.
     """
 
     def __init__(self, host: ServerHost, definition: CameraDefinition) -> None:

@@ -83,7 +83,7 @@ class SessionFtpServer(Generic[FilesT]):
     creates_missing: ClassVar[bool] = True
     """True if OpenFileWO creates a missing file."""
     max_stored_reply_size: ClassVar[int] = 4
-    """Maximum size in bytes of the data of a reply that is stored. A stored reply answers a repeated request."""
+    """Replies with more bytes of data than this are not stored. A stored reply answers a repeated request."""
     crc_block: ClassVar[int] = 65_536
     crc_blocks_at_once: ClassVar[int] = 8
     """Number of blocks of a file that are read for a checksum before the event loop continues."""
@@ -313,7 +313,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _send_block(self, client: ServedClient, session: FtpSession, request: FtpPacket, *, may_end: bool) -> None:
         """Send a block of a burst, or the NAK that ends the burst.
 
-        With ``may_end``, this block is the burst's last one if it has sent enough bytes.
+        With ``may_end``, this block ends the burst if the burst has sent enough bytes.
         """
         refusal = request.refuse(MavFtpErr.EOF)
         try:

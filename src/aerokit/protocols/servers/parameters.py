@@ -29,7 +29,7 @@ class NamedList(Protocol):
 class ParameterLists:
     """Sends all parameters on a channel when a client requests the list.
 
-    ``burst`` parameters are sent at a time, and ``list_rate_hz`` in a second. A new request restarts the list.
+    It sends ``burst`` parameters at a time, ``list_rate_hz`` parameters per second. A new request restarts the list.
     """
 
     burst: int = 5
