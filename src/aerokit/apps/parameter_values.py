@@ -29,7 +29,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:
     """Add a note to the result if the value was set without a check of its range.
 
-    ``option`` is the command line option that loads metadata.
+    The note mentions ``option``, the command line option that loads metadata with ranges.
     """
     if result.error is not None or result.outcome == "unchanged":
         return result

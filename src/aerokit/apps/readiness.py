@@ -194,7 +194,7 @@ class ArmingCheckRequests:
         self._requested_at: dict[Vehicle, float] = {}
 
     def take_due(self, vehicle: Vehicle) -> bool:
-        """Return True, only once, when `run_arming_checks` must be called for the vehicle."""
+        """Return True if the caller must call `run_arming_checks` for the vehicle now. The next call returns False."""
         failing = _failing_checks(vehicle)
         if failing is None:
             self._failing.pop(vehicle, None)

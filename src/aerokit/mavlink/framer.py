@@ -27,8 +27,8 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# The last item has four bytes: the message id and the first byte of the payload. ``struct`` has no format for three
-# bytes.
+# The id in _HEADER_V2 has four bytes: the message id and the first byte of the payload. ``struct`` has no format for
+# three bytes.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from
@@ -224,7 +224,7 @@ class PythonFramer:
     # -------------------------------------------------------------------------------- slow path
 
     def _search(self, data: bytes, begin: int, scan: _ScanState) -> _ValidFrame | None:
-        """Return the next valid frame from ``begin`` on, or None. Keep data that may become a frame in ``_rest``."""
+        """Return the next valid frame from ``begin`` on, or None. Store data of an incomplete frame in ``_rest``."""
         size = len(data)
         keep_from = -1  # position from which data is kept
         unknown_begin = unknown_end = -1  # a possible frame of an unknown message; -1 if there is none
@@ -300,9 +300,9 @@ class PythonFramer:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
-        """Examine a possible frame at ``begin``. Return the verdict, the position of its end, and the valid frame.
+        """Examine a possible frame at ``begin``. Return the verdict, the end of the frame, and a valid frame.
 
-        If the header is incomplete, the second value is the end of the header.
+        If the header is incomplete, the end of the header is returned instead of the end of the frame.
         """
         size = len(data)
         if data[begin] == MAGIC_V2:
@@ -340,7 +340,7 @@ class PythonFramer:
 
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
-    """Return the earliest of three candidates for the beginning of a frame. The first two may be missing (-1)."""
+    """Return the first of these positions in the data. -1 stands for a position that is missing."""
     if unknown_begin >= 0:  # `_search` sets `unknown_begin` only before `keep_from`.
         return unknown_begin
     return position if keep_from < 0 else keep_from

@@ -14,9 +14,9 @@ _WINDOW = (1 << _HALF) - 1  # mask of the bits in `_missing`
 _MAX_STEP = 4  # Sequence numbers of consecutive frames of one stream rarely differ by more.
 _MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
 _MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
-_EXPIRY_S = 5.0  # A second stream and its alternations are forgotten after this time.
+_EXPIRY_S = 5.0  # A second stream is forgotten when it has been silent for this time.
 _STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
-_MIN_RETURNS = 3  # A longer previous stream replaces the current one after this many further frames.
+_MIN_RETURNS = 3  # If the previous stream had more frames, it becomes current again with its third further frame.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHERS = range(3)
@@ -57,7 +57,7 @@ class SourceStatistics(SourceFields):
     # The following are set when a second stream with the same ids begins.
     _other_count: int  # number of frames of the second stream
     _other_at: float
-    _skipped_over: int  # number of frames that count as lost between the two streams
+    _skipped_over: int  # number of sequence numbers between the two streams, which count as lost frames
     _returns: int  # number of further frames of the previous stream
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
@@ -164,8 +164,8 @@ class SourceStatistics(SourceFields):
         is_direct_succession = follows and self._received_at_repetition == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        # Four recent frames in succession are required, because a link may repeat two or three. It hardly ever repeats
-        # older frames, so two of these are enough.
+        # A link may repeat two or three recent frames, so four are required. Links hardly ever repeat older frames, so
+        # two are enough.
         min_run = 3 if is_near else 1
         if self._late_run >= min_run:
             self._begin_stream(now)
@@ -240,7 +240,7 @@ class SourceStatistics(SourceFields):
 
 
 class SourceLimit:
-    """Limits the number of senders with separate counters, for all framers that share it.
+    """Limits the number of senders for which framers keep separate counters. Several framers can share a limit.
 
     When the limit is reached, senders that were silent for at least 10 s are dropped.
     """

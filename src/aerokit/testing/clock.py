@@ -116,7 +116,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # The next iteration polls if that is due. If there is no timer, it runs the event sources again.
+            # Nothing to run. The next iteration polls if a poll is due, and otherwise runs the event sources again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             # Otherwise, the next event is a timer.

@@ -174,7 +174,7 @@ class FaultyLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """Number of writes that the wrapped link or a stall dropped, and of frames that overflowed `outgoing`.
+        """Number of writes dropped by the wrapped link, by a stall or by the full queue of `outgoing`.
 
         Frames that were lost in transit do not count.
         """
@@ -415,8 +415,8 @@ class _DeliveryQueue:
                     break
                 heappop(self._waiting)
                 action()
-        finally:  # The other actions run even if one raises an exception. The event loop reports it.
-            # If an action has called `put`, the new timer may be for an action that has already run.
+        finally:  # If an action raises an exception, the event loop reports it, and a new timer runs the other actions.
+            # An action may have called `put`, which started a timer. The timer's own action may have run meanwhile.
             if self._timer is not None:
                 self._timer.cancel()
                 self._timer = None

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 _MARKER = "simulated"
 _PICTURES_OPTION = "--flight-pictures"
-# Attribute of a test function that pytest-asyncio runs. It holds a function that opens the flights and calls the test.
+# Name of an attribute of test functions that pytest-asyncio runs. Its value is a function that opens the flights and
+# calls the test.
 _TEST_WITH_OPEN_FLIGHTS = "_aerokit_test_with_open_flights"
 # The plugin compares names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")

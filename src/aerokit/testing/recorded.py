@@ -240,7 +240,8 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        # Number of answers sent from each list of recorded answers. The `id()`s of its answers identify a list.
+        # Maps lists of recorded answers to the number of answers that were sent. A list is identified by the `id()`s of
+        # its answers.
         self._answered_counts: dict[tuple[int, ...], int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""

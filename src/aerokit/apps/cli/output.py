@@ -160,8 +160,8 @@ _CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))
 def plain_text(error: BaseException) -> str:
     """Return the text of an error in the words of the command line.
 
-    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Reasons
-    that only announce a mission item, such as ``Mission: 3 WP``, are left out.
+    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Status
+    texts about mission items, such as ``Mission: 3 WP``, are removed.
     """
     text = _MISSION_REASON.sub("", str(error))
     call = _CALL.match(text)

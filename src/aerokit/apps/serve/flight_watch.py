@@ -67,11 +67,11 @@ class FlightWatch:
         # The last descent at IMPACT_M_S or faster.
         self._last_sink_at = -math.inf
         self._last_sink_m_s = 0.0
-        # The last impact; None if there was none. An impact that was certainly no crash is dismissed.
+        # The last impact; None if there was none.
         self._impact_at: float | None = None
         self._impact_altitude_m: float | None = None
         self._was_sudden_stop = False
-        self._is_impact_dismissed = False
+        self._is_impact_dismissed = False  # True if the impact was certainly no crash
         # Start of the time without motion after the impact, and number of velocity reports since then.
         self._still_since = math.inf
         self._still_samples = 0
@@ -102,10 +102,10 @@ class FlightWatch:
 
     @property
     def disarming(self) -> dict[str, Any] | None:
-        """The last disarming, if it was before take-off and without an order of this server; otherwise None.
+        """The last disarming; None if the vehicle had taken off, or if this server had ordered the disarming.
 
-        ``age_s`` is the time since then. ``armed_for_s`` is the time from arming to disarming. ``parameter`` is the
-        autopilot's parameter for automatic disarming, and ``delay_s`` its value.
+        ``age_s`` is the time since the disarming. ``armed_for_s`` is the time from arming to disarming. ``parameter``
+        is the autopilot's parameter for automatic disarming, and ``delay_s`` its value.
         """
         if self._disarming is None:
             return None
@@ -155,8 +155,8 @@ class FlightWatch:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
         has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
         if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
-            # A crashed vehicle with running motors may report take-offs although it lies still. It counts as flying
-            # once it has climbed from this height. If its height is unknown, it counts as flying at once.
+            # A crashed vehicle with running motors may report a take-off although it lies still. The report is believed
+            # when the vehicle has climbed from its present altitude, or at once if this altitude is unknown.
             self._take_off_altitude_m = altitude_amsl(self._vehicle.telemetry)
             if self._take_off_altitude_m is None:
                 self._dismiss_impact()

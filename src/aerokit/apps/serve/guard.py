@@ -246,10 +246,10 @@ class _HttpConnection(H11Protocol):
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket connection with a correction, for the argument ``ws`` of `uvicorn.Config`.
+    """uvicorn's WebSocket connection without a false log message. Pass the class as ``ws`` to `uvicorn.Config`.
 
-    uvicorn 0.35 to 0.54 do not mark a handshake as complete when the app has refused it, and then log the error "ASGI
-    callable returned without completing handshake".
+    After the app has refused a handshake, uvicorn 0.35 to 0.54 log the error "ASGI callable returned without completing
+    handshake".
     """
 
     async def send(self, message: Any) -> None:
