@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
     """Raise InvalidArgument if the metadata does not allow some of the values.
 
-    Names without metadata are accepted. ``force`` is the option that sets the values nevertheless.
+    Names without metadata are accepted. The text mentions ``force``, the option that sets the values nevertheless.
     """
     if metadata is None:
         return

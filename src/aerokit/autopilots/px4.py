@@ -120,7 +120,7 @@ class Px4(Autopilot):
     reposition_purpose: Purpose = "hold"
     holds_after_mission = True
     mission_end_text: str | None = "Mission finished"  # mission_base.cpp
-    # mission_base.cpp, update_mission. A finished mission is not flown again before an item is selected.
+    # mission_base.cpp, update_mission. A finished mission counts as no mission until an item is selected.
     no_mission_text: str | None = "No valid mission available"
     prearm_depends_on_mode = True
     # PX4 answers by a status text for each failing check (Commander.cpp; measured with 1.17 in simulation).
@@ -206,7 +206,7 @@ class Px4(Autopilot):
         return (self.mode(px4_custom_mode(main & 0xFF, sub & 0xFF), CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name to store for a mode, or None. The name of an external mode replaces EXTERNAL1 etc."""
+        """Like the method of the base class, but a reported name replaces EXTERNAL1 to EXTERNAL8."""
         if name.startswith("("):  # "(Mode not available)": this external mode is not registered
             return None
         if custom_mode in _EXTERNAL_MODES:

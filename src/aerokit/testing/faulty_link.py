@@ -42,8 +42,9 @@ class StalledQueue:
     """Simulates a TCP connection that is stalled until `drain`.
 
     The simulated operating system accepts the first ``system_bytes``. Further bytes wait in an `Outbox` per peer.
-    ``carry(data, peer)`` sends bytes. ``on_drop`` is called with the number of writes that an outbox drops.
-    When an outbox stalls or drains, ``on_stall`` is called with True if any outbox is now stalled, otherwise False.
+
+    ``carry(data, peer)`` sends bytes. ``on_drop(count)`` is called when an outbox drops writes.
+    ``on_stall(is_any_stalled)`` is called when an outbox stalls or drains.
     """
 
     def __init__(

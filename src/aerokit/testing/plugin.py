@@ -141,7 +141,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
-    """Open ``flight`` and ``fleet`` around an ``async def`` test, and run it if there is no async plugin."""
+    """Open the fixtures ``flight`` and ``fleet`` around an ``async def`` test. Run the test if no async plugin does."""
     # A test with `served_flight` fails as soon as the simulated vehicle raises an exception.
     with _function_replaced(pyfuncitem, _runnable_function(pyfuncitem)), _raising_vehicle_errors(pyfuncitem):
         return (yield)

@@ -201,11 +201,11 @@ class RecordedVehicle(SimulatedVehicle):
     """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
     - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
-      other params. Their delays are those of the recording. A repeated command gets the recorded answers in turn, and
-      then always the last. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the latest played
-      message of this type or, if none was played yet, the first in the recording.
+      other params, each after its recorded delay. If a command is repeated, it gets the next recorded answer; after the
+      last one, it gets the last one again. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the
+      latest played message of this type or, if none was played yet, the first in the recording.
     - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
-      recording can be set. A request for another parameter gets PARAM_ERROR if the recorded vehicle ever sent
+      recording can be set. A request for an unknown parameter gets PARAM_ERROR if the recorded vehicle ever sent
       PARAM_ERROR, otherwise no answer.
     - Missions: the vehicle has the recorded missions. An upload or a clearing gets the recorded result or, if there is
       none, UNSUPPORTED.

@@ -109,10 +109,7 @@ TRANSMITTER_ON_S = 1.0
 
 
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
-    """Parse ``NAME[=VALUE][@SECONDS]`` into the name, the value and the time of a simulated fault.
-
-    The time is in simulated seconds.
-    """
+    """Parse a simulated fault, ``NAME[=VALUE][@SECONDS]``. Return its name, its value and its start in seconds."""
     name_and_value, _, begin_text = text.partition("@")
     name, equals, value = name_and_value.partition("=")
     if name not in FAULTS:

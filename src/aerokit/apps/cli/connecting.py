@@ -161,10 +161,7 @@ def add_action(
     *,
     connects: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add the action ``name`` to a command.
-
-    With ``connects``, it also has the options for a connection to a vehicle.
-    """
+    """Add the action ``name`` to a command. With ``connects``, include the options for a connection to a vehicle."""
     parents = [_vehicle_parser()] if connects else []
     summary = text[0].lower() + text[1:].partition(". ")[0].rstrip(".")
     action = actions.add_parser(name, help=summary, description=text, parents=parents)

@@ -72,9 +72,8 @@ class FlightWatch:
         self._impact_altitude_m: float | None = None
         self._was_sudden_stop = False
         self._is_impact_dismissed = False  # True if the impact was certainly no crash
-        # Start of the time without motion after the impact, and number of velocity reports since then.
-        self._still_since = math.inf
-        self._still_samples = 0
+        self._still_since = math.inf  # after an impact: since when the vehicle has not moved
+        self._still_samples = 0  # number of velocity reports since then
         self._moving_since = math.inf  # after a crash: when the vehicle began to move
         self._take_off_altitude_m: float | None = None  # after a crash: where a take-off was reported
         self._armed_at: float | None = None  # None if the vehicle was armed before this object was created
