@@ -194,7 +194,7 @@ class ArmingCheckRequests:
         self._requested_at: dict[Vehicle, float] = {}
 
     def take_due(self, vehicle: Vehicle) -> bool:
-        """Return True if the caller must call `run_arming_checks` for the vehicle now. The next call returns False."""
+        """Return True if `run_arming_checks` is due for the vehicle. The checks then count as requested."""
         failing = _failing_checks(vehicle)
         if failing is None:
             self._failing.pop(vehicle, None)

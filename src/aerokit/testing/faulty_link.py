@@ -165,8 +165,8 @@ class FaultyLink(Link):
         self._stalled_queue: StalledQueue | None = None  # None before the first call of `stall`
         self._stalled_at: float | None = None  # start of the present stall; None if there is none
         self._expired_writes = 0
-        self._drained = asyncio.Event()  # not set while a closed link still delivers frames
-        self._drained.set()
+        self._delivered = asyncio.Event()  # not set while a closed link still delivers frames
+        self._delivered.set()
 
     @property
     def address(self) -> str:  # type: ignore[override]
@@ -278,13 +278,13 @@ class FaultyLink(Link):
         if in_flight is None or in_flight.loop.is_closed() or in_flight.is_empty:  # There is nothing left to deliver.
             self.link.close()
             return
-        self._drained.clear()
+        self._delivered.clear()
         latest_close = in_flight.loop.time() + LINGER_S
         in_flight.put(min(in_flight.latest_due, latest_close), self._close_link)
 
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
-        await self._drained.wait()
+        await self._delivered.wait()
         await self.link.wait_closed()
 
     def _count_expired(self, writes: int) -> None:
@@ -308,7 +308,7 @@ class FaultyLink(Link):
             self._stalled_queue.close()
         if self._in_flight is not None:
             self._in_flight.clear()
-        self._drained.set()
+        self._delivered.set()
 
     def _close_link(self) -> None:
         self._discard_in_transit()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.mavlink.enums import MavLandedState, MavType
 from aerokit.vehicle.commanding.ground import IMPACT_M_S, STILL_M_S, ImpactDetector
@@ -50,6 +50,11 @@ CRASH_LANDED_MAX_AGE_S = 3.0
 _IN_AIR = (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING)
 
 
+class _Disarming(NamedTuple):
+    at: float
+    armed_for_s: float
+
+
 class FlightWatch:
     """Detects a crash of one vehicle, and disarming without an order. Sends nothing.
 
@@ -80,7 +85,7 @@ class FlightWatch:
         self._armed_until = -math.inf  # when the vehicle was last disarmed
         self._was_in_air = False  # True if the vehicle was in the air since the last arming
         self._disarm_ordered_at = -math.inf
-        self._disarming: tuple[float, float] | None = None  # time of the disarming, and seconds armed before it
+        self._disarming: _Disarming | None = None  # the last disarming without an order and without a flight
         self._detachments: tuple[Callable[[], None], ...] = (
             vehicle.velocity.observe(self._on_velocity, every_arrival=True),
             vehicle.armed.observe(self._on_armed),
@@ -147,8 +152,9 @@ class FlightWatch:
         elif before:
             self._armed_until = now
             was_ordered = now - self._disarm_ordered_at <= DISARM_ORDER_MAX_AGE_S
-            if self._armed_at is not None and not self._was_in_air and not was_ordered and self._crash is None:
-                self._disarming = now, now - self._armed_at
+            has_flown = self._was_in_air or self._crash is not None
+            if self._armed_at is not None and not has_flown and not was_ordered:
+                self._disarming = _Disarming(now, armed_for_s=now - self._armed_at)
 
     def _on_landed(self, before: int | None, landed: int) -> None:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
@@ -175,8 +181,16 @@ class FlightWatch:
         # a second impact. After a crash, no further impact is detected.
         elif self._crash is None and (self._impact_at is None or self._impact_at < self._last_sink_at):
             self._start_impact(at, down_m_s)
-        if self._impact_at is not None:
-            self._evaluate_impact(at, velocity.ground_speed_m_s, vertical_speed_m_s=abs(down_m_s))
+        if self._impact_at is None or self._is_impact_dismissed:
+            return
+        ground_speed_m_s, vertical_speed_m_s = velocity.ground_speed_m_s, abs(down_m_s)
+        is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
+        if self._crash is None:
+            self._check_crashed(at, self._impact_at, is_still=is_still)
+        else:
+            self._check_flies_again(
+                at, is_still=is_still, is_fast=max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
+            )
 
     def _start_impact(self, at: float, down_m_s: float) -> None:
         self._forget_impact()
@@ -186,32 +200,30 @@ class FlightWatch:
         armed = self._vehicle.armed.latest
         self._is_impact_dismissed = not armed and at - self._armed_until > CRASH_ARMED_WITHIN_S
 
-    def _evaluate_impact(self, at: float, ground_speed_m_s: float, vertical_speed_m_s: float) -> None:
-        if self._is_impact_dismissed or self._impact_at is None:
-            return
-        is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
-        if self._crash is not None:
-            self._moving_since = math.inf if is_still else min(self._moving_since, at)
-            is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
-            # A slow vehicle counts as flying only after it has moved for CRASH_STILL_S, the time it had to lie still
-            # before it counted as crashed.
-            is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
-            if self._vehicle.armed.latest and (is_moving or self._has_climbed):
-                self._dismiss_impact()  # the vehicle flies again
-            return
+    def _check_flies_again(self, at: float, *, is_still: bool, is_fast: bool) -> None:
+        """Forget the crash if the armed vehicle moves or has climbed."""
+        self._moving_since = math.inf if is_still else min(self._moving_since, at)
+        # A slow vehicle counts as flying only after it has moved for CRASH_STILL_S. It had to lie still for the same
+        # time before it counted as crashed.
+        is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
+        if self._vehicle.armed.latest and (is_moving or self._has_climbed):
+            self._dismiss_impact()
+
+    def _check_crashed(self, at: float, impact_at: float, *, is_still: bool) -> None:
+        """Record a crash if there is evidence. Dismiss the impact if the evidence is missing for too long."""
         if is_still and self._is_at_impact_height():
             self._still_since = min(self._still_since, at)
             self._still_samples += 1
-        elif at - self._impact_at <= CRASH_STILL_WITHIN_S:  # the vehicle may still come to rest
+        elif at - impact_at <= CRASH_STILL_WITHIN_S:  # the vehicle may still come to rest
             self._still_since = math.inf
             self._still_samples = 0
         else:
             self._dismiss_impact()
             return
-        if at - self._impact_at > CRASH_EVIDENCE_WITHIN_S:
+        if at - impact_at > CRASH_EVIDENCE_WITHIN_S:
             self._dismiss_impact()
         elif self._has_crashed(at):
-            ago_s = self._now() - self._impact_at
+            ago_s = self._now() - impact_at
             self._crash = {
                 "text": self._detector.describe(),
                 "at_unix_s": round(self._vehicle.connection.unix_time() - ago_s, 1),

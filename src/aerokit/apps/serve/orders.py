@@ -347,9 +347,9 @@ class OrderRunner:
             )
         parsed = order_type.parse(arguments)
         earlier = self._records.get(key)
-        if earlier is not None and earlier.is_same(vehicle.system_id, order_type.name, parsed.recorded):
-            return earlier
         if earlier is not None:
+            if earlier.is_same(vehicle.system_id, order_type.name, parsed.recorded):
+                return earlier
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
         # The client may be retrying this same order. With a new key, it would be executed again.
         if key in self._used_keys:
@@ -414,8 +414,10 @@ class OrderRunner:
                 f"{order_type.name}: vehicle {vehicle.system_id} is silent"
                 f" (last heartbeat {vehicle.heartbeat_age:.1f} s ago); nothing was sent"
             )
-        records = [record for record in self._records.values() if record.system_id == vehicle.system_id]
-        if len([record for record in records if record.state == "running"]) >= MAX_RUNNING:
+        running_count = sum(
+            record.system_id == vehicle.system_id and record.state == "running" for record in self._records.values()
+        )
+        if running_count >= MAX_RUNNING:
             raise BusyError(
                 f"{MAX_RUNNING} orders to vehicle {vehicle.system_id} are already running; nothing was sent"
             )
