@@ -219,8 +219,8 @@ class SourceStatistics(SourceFields):
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
-        # The sequence numbers between the two streams are not lost frames. max() is needed, because late frames among
-        # them are already subtracted.
+        # No frames were lost between the two streams. If some of these sequence numbers have arrived late, they are
+        # already subtracted, so the difference may be negative.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
         self._other_count = current_count

@@ -109,9 +109,9 @@ def unscaled_xy(item: MissionItem) -> tuple[float, float]:
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Convert degrees, metres of a local frame, or an unscaled parameter, to ``x`` or ``y``.
+    """Return the ``x`` or ``y`` of an item for degrees, for metres in a local frame, or for an unscaled parameter.
 
-    This is the inverse of :func:`unscaled_xy`. Only unscaled parameters can have a fraction afterwards.
+    This is the inverse of :func:`unscaled_xy`. Degrees and metres are rounded to an integer.
     """
     if math.isnan(value):
         return DEFAULT_XY

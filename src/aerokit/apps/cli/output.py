@@ -316,9 +316,9 @@ def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Check that a recording can be written, and remove the file after the block if it is new and empty.
+    """Check that a recording can be written to ``path``. After the block, remove the file if it is new and empty.
 
-    None stands for no recording. Raises PermissionError if the folder is not writable.
+    Do nothing if ``path`` is None. Raises PermissionError if the folder is not writable.
     """
     if path is None:
         yield

@@ -87,8 +87,8 @@ def simulated_fleet(
 ) -> list[SimulatedVehicle]:
     """Create ``count`` vehicles with consecutive system ids and seeds, in a row eastwards from ``home``.
 
-    ``components`` makes the components of one vehicle. ``name`` is the kind of vehicle or the path of a recording. A
-    recording needs a ``count`` of 1, and ignores the other arguments.
+    ``components`` makes the components of one vehicle. ``name`` is the kind of vehicle or the path of a recording. For
+    a recording, ``count`` must be 1, and the other arguments are ignored.
     """
     if name.endswith(".tlog"):
         return [_recorded(name, count)]

@@ -135,7 +135,7 @@ async def _pause(vehicle: Vehicle, _: dict[str, Any]) -> object:
 
 
 async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
-    # An ArduCopter on the ground whose mission is finished would take off and fly the mission again.
+    # On the ground, an ArduCopter with a finished mission would take off and fly the mission again.
     is_on_ground = is_reported_on_ground(vehicle, max_age_s=_LANDED_STATE_MAX_AGE_S)
     if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in SURFACE_TYPES:
         raise OperationRejected(
