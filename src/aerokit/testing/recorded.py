@@ -133,8 +133,10 @@ class RecordedMissions(MissionServer):
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
         kind = message.mission_type
-        is_upload = isinstance(message, m.MissionCount)
-        is_recorded = kind in self._vehicle.recording.uploads if is_upload else self.items(kind) is not None
+        if isinstance(message, m.MissionCount):  # an upload
+            is_recorded = kind in self._vehicle.recording.uploads
+        else:
+            is_recorded = self.items(kind) is not None
         return None if is_recorded else MavMissionResult.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
@@ -173,7 +175,7 @@ class RecordedMissions(MissionServer):
         """Do nothing: the recording decides which item is current."""
 
     def _recorded_result(self, request: str, results: list[int], mission_type: int) -> int:
-        """Return the next of the recorded results. The last one repeats."""
+        """Return the next of the recorded results. After the last one, return it again."""
         number = self._result_counts.get((request, mission_type), 0)
         self._result_counts[request, mission_type] = number + 1
         return results[min(number, len(results) - 1)]

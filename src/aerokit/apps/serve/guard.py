@@ -176,10 +176,10 @@ RawHeaders = list[tuple[bytes, bytes]]
 
 
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
-    """Return a class that limits anonymous connections, for the argument ``http`` of `uvicorn.Config`.
+    """Return a connection class for the argument ``http`` of `uvicorn.Config`. It limits anonymous connections.
 
-    A connection is anonymous until one of its requests has the token. If there are too many, one of the anonymous
-    connections is closed.
+    A connection is anonymous until one of its requests has the token. If there are too many anonymous connections, one
+    of them is closed.
     """
     anonymous: dict[_HttpConnection, None] = {}
 
