@@ -50,7 +50,7 @@ class ItemStorage(Enum):
 
 
 # How an autopilot stores the parameters of each command: one letter for each of `FIELDS`, explained in `_stored_as`.
-# Fields without a letter are not stored.
+# Fields without a letter are not stored, except those of a place.
 _ARDUPILOT_FORMS: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # The first string is for Copter, Rover and Sub, the second for Plane.
     MavCmd.NAV_LOITER_UNLIM: ("--r",),

@@ -96,7 +96,7 @@ _MODE_OF_FRAME: dict[int, int] = {
 
 
 def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
-    """Return the items of each entry of ``mission.items``. The target of a jump is its index among all items."""
+    """Return the items of each entry of ``mission.items``. Jumps have the index of their target among all items."""
     groups = [_simple_values(entry) for entry in entries]  # None for a landing pattern, whose items are generated
     landings = {number: landing_items(entries[number]) for number, group in enumerate(groups) if group is None}
     sizes = [len(landings[number]) if group is None else len(group) for number, group in enumerate(groups)]

@@ -270,7 +270,7 @@ def _emit_warnings(plan: Plan, options: argparse.Namespace) -> list[str]:
 
 
 def _notes(plan: Plan) -> list[str]:
-    """Return a note if only ArduPilot accepts the items. None is needed if the plan says that it is for ArduPilot."""
+    """Return a note if only ArduPilot accepts the mission, unless the plan is marked as a plan for ArduPilot."""
     if plan.firmware_type == MavAutopilot.ARDUPILOTMEGA:
         return []
     try:
