@@ -96,7 +96,7 @@ class Px4(Autopilot):
     signing_key_restriction = "PX4 accepts a signing key only on its USB port, and before 1.17 on no port"
     modes = MODES
     modes_are_numbered = False
-    # PX4's MAVLink module acknowledges DO_SET_MODE at once with ACCEPTED. Its commander acknowledges it with the result.
+    # PX4's MAVLink module acknowledges DO_SET_MODE at once with ACCEPTED. Later, the commander acknowledges the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")

@@ -74,7 +74,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that comes first in `STANDARD_FILES`. Use the remarks of ``added``, if any."""
+    """Return ``existing`` with the origin that is first in `STANDARD_FILES`. Use the remarks of ``added``, if any."""
     origin = min(
         existing.origin,
         added.origin,
