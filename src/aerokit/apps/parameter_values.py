@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
     """Raise InvalidArgument if the metadata does not allow some of the values.
 
-    Names without metadata are accepted. ``force`` is the option that sets the values nevertheless.
+    Names without metadata are accepted. The text mentions ``force``, the option that sets the values nevertheless.
     """
     if metadata is None:
         return
@@ -29,7 +29,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:
     """Add a note to the result if the value was set without a check of its range.
 
-    ``option`` is the command line option that loads metadata.
+    The note mentions ``option``, the command line option that loads metadata with ranges.
     """
     if result.error is not None or result.outcome == "unchanged":
         return result

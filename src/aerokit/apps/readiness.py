@@ -193,7 +193,7 @@ class ArmingCheckRequests:
         self._requested_at: dict[Vehicle, float] = {}
 
     def take_due(self, vehicle: Vehicle) -> bool:
-        """Return True, only once, when `run_arming_checks` must be called for the vehicle."""
+        """Return True if `run_arming_checks` is due for the vehicle. The checks then count as requested."""
         failing = _failing_checks(vehicle)
         if failing is None:
             self._failing.pop(vehicle, None)

@@ -433,10 +433,7 @@ class Autopilot:
 
     @staticmethod
     def _missing_estimates(flags: int, *, required: int, horizontal: int) -> tuple[str, ...]:
-        """Return the missing estimates.
-
-        The vehicle needs all of ``required``, and one of those in ``horizontal``.
-        """
+        """Return the names of missing estimates. All bits of ``required`` are needed, and one bit of ``horizontal``."""
         missing = bit_names(required & ~flags, ESTIMATES)
         return missing if flags & horizontal else (*missing, ESTIMATES[POS_HORIZ_ABS])
 

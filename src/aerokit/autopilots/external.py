@@ -71,7 +71,7 @@ def _external_navigation(quantity: str) -> ExternalRule:
 
 _GPS_ALONE = (("EK3_SRC1_POSXY", (3.0,)), ("EK3_SRC2_POSXY", (0.0, 3.0)), ("GPS2_TYPE", (0.0,)))
 
-# `required` has the values that select MAVLink as the driver of a sensor, e.g. GPS1_TYPE 14.
+# The values in `required` make ArduPilot read the sensor over MAVLink, e.g. GPS1_TYPE 14.
 ARDUPILOT_EXTERNAL = ExternalRules(
     kinds={
         "odometry": _external_navigation("POSXY"),

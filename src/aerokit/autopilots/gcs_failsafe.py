@@ -62,7 +62,7 @@ navigator parameters of PX4.
 def gcs_failsafe(firmware: str, value_of: Callable[[str], float | None]) -> tuple[str | None, str | None]:
     """Return the name of the parameter that sets the action of the failsafe, and the action, such as ``lands``.
 
-    The action is None if ``value_of`` returns None for the parameter. Both are None if no parameter sets an action.
+    The action is None if ``value_of`` does not know the parameter. Both are None if no parameter sets an action.
     """
     for name, actions in GCS_FAILSAFE_ACTIONS.get(firmware, {}).items():
         value = value_of(name)

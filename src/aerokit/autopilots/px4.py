@@ -96,7 +96,7 @@ class Px4(Autopilot):
     signing_key_restriction = "PX4 accepts a signing key only on its USB port, and before 1.17 on no port"
     modes = MODES
     modes_are_numbered = False
-    # PX4's MAVLink module acknowledges at once with ACCEPTED. The commander acknowledges later with the result.
+    # PX4's MAVLink module acknowledges DO_SET_MODE at once with ACCEPTED. Later, the commander acknowledges the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
@@ -207,7 +207,7 @@ class Px4(Autopilot):
         return (self.mode(px4_custom_mode(main & 0xFF, sub & 0xFF), CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name to store for a mode, or None. The name of an external mode replaces EXTERNAL1 etc."""
+        """Like the method of the base class, but a reported name replaces EXTERNAL1 to EXTERNAL8."""
         if name.startswith("("):  # "(Mode not available)": this external mode is not registered
             return None
         if custom_mode in _EXTERNAL_MODES:

@@ -244,7 +244,7 @@ class PythonFramer:
     # -------------------------------------------------------------------------------- slow path
 
     def _search(self, data: bytes, begin: int, scan: _ScanState) -> _ValidFrame | None:
-        """Return the next valid frame from ``begin`` on, or None. Keep data that may become a frame in ``_rest``."""
+        """Return the next valid frame from ``begin`` on, or None. Store data of an incomplete frame in ``_rest``."""
         size = len(data)
         keep_from = -1  # position from which data is kept
         unknown_begin = unknown_end = -1  # a possible frame of an unknown message; -1 if there is none
@@ -360,7 +360,7 @@ class PythonFramer:
 
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
-    """Return the earliest of three candidates for the beginning of a frame. The first two may be missing (-1)."""
+    """Return the first of these positions in the data. -1 stands for a position that is missing."""
     if unknown_begin >= 0:  # `_search` sets `unknown_begin` only before `keep_from`.
         return unknown_begin
     return position if keep_from < 0 else keep_from

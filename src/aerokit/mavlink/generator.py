@@ -74,7 +74,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that is first in `STANDARD_FILES`. Remarks of ``added`` take precedence."""
+    """Return ``existing`` with the origin that is first in `STANDARD_FILES`. Use the remarks of ``added``, if any."""
     origin = min(
         existing.origin,
         added.origin,
@@ -122,8 +122,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "development": ("development",),
 }
 
-# Messages of ``common.xml`` that every flight uses, for ``common.py``. The other two hundred are in ``common_more.py``,
-# which is imported only if a program needs one, because its import takes several times as long.
+# These messages of ``common.xml``, which most flights use, are in ``common.py``. The other two hundred are in
+# ``common_more.py``. A program that needs none of these does not import this module, because its import is slow.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt

@@ -376,12 +376,12 @@ def make_enum(
     *,
     is_external: bool = False,
 ) -> type[Any]:
-    """Create an ``IntFlag`` for a bitmask, else an ``IntEnum``. Two names for one value are aliases.
+    """Create an ``IntFlag`` for a bitmask, else an ``IntEnum``. A second name for a value becomes an alias.
 
-    ``is_external`` is True for a definition that aerokit has not generated. Its names are checked.
+    ``is_external`` is True for a definition that aerokit has not generated. Only such names are checked.
 
     Raises:
-        TypeError, ValueError: a checked name is a duplicate or reserved.
+        TypeError, ValueError: an external name is a duplicate or reserved.
     """
     base: Any = _Flags if bitmask else enum.IntEnum
     enum_type: type[Any]

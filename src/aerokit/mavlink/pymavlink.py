@@ -276,9 +276,9 @@ class _Layout:
 
     def __init__(self, message_class: Any) -> None:
         zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
-        # The attributes in wire order; for a text field, the attribute with the raw bytes.
+        # The names of the attributes, in wire order. A text field is listed by the attribute with its raw bytes.
         self.names: list[str] = []
-        # The position and the number of each field's values; empty if there are no arrays.
+        # For each field, the position of its first unpacked value, and their number. Empty if no field is an array.
         self.arrays: list[tuple[int, int]] = []
         self.texts: list[tuple[str, str]] = []  # for each text field, its name and the name of its raw bytes
         position = 0

@@ -170,8 +170,8 @@ def _message_definition(cls: Any) -> MessageDefinition:
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
     """Return the definition with its extension fields marked."""
     fields = definition.fields
-    # pymavlink's classes do not mark extensions. Each possible number of base fields is tried, until CRC_EXTRA and
-    # the wire order match.
+    # pymavlink's classes do not mark extensions. Try each possible number of base fields until CRC_EXTRA and the wire
+    # order match.
     for base_count in range(len(fields), -1, -1):
         guess = MessageDefinition(
             definition.id,

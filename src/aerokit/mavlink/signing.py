@@ -186,7 +186,10 @@ class Signing:
         """Last timestamp of each (system id, component id, link id). :meth:`for_link` shares it among links."""
 
     def for_link(self, link_id: int) -> Signing:
-        """Return a `Signing` for another link (0–255) with the same key. Each refuses replays of the other's frames."""
+        """Return a `Signing` for another link (0–255) with the same key.
+
+        If one of the two has accepted a frame, the other refuses this frame as a replay.
+        """
         signing = Signing(self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned)
         signing.streams = self.streams
         signing._timestamp_file = self._timestamp_file
@@ -278,10 +281,9 @@ class Signing:
         self._advance(max(self.timestamp, timestamp))
 
     def _advance(self, timestamp: int) -> None:
-        # Store the timestamp before using it, so that the next program starts with a later timestamp even after a
-        # crash.
+        # Store the timestamp before using it: even after a crash, the next program then starts with a later timestamp.
         if self._timestamp_file is not None:
-            # A restarted program may be up to half a minute ahead of other senders. Receivers accept one minute.
+            # After a restart, our timestamps may be half a minute ahead of other senders'. Receivers accept a minute.
             self._timestamp_file.reserve(timestamp, ONE_MINUTE // 2)
         self.timestamp = timestamp
 
@@ -322,7 +324,7 @@ class TimestampFile:
         """Write ``timestamp + ahead``, unless the last write was of a timestamp later than ``timestamp``."""
         if timestamp < self.timestamp:
             return
-        # Set before writing, so that a failed write is not retried with every frame. Writing may block the event loop.
+        # Set the attribute even if the write fails: a retry for every frame might block the event loop each time.
         self.timestamp = min(timestamp + ahead, self._maximum)
         try:
             self._write(self.timestamp)

@@ -14,7 +14,7 @@ _WINDOW = (1 << _HALF) - 1  # mask of the bits in `_missing`
 _MAX_STEP = 4  # Sequence numbers of consecutive frames of one stream rarely differ by more.
 _MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
 _MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
-_EXPIRY_S = 5.0  # A second stream and its alternations are forgotten after this time.
+_EXPIRY_S = 5.0  # A second stream is forgotten when it has been silent for this time.
 _STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
 _MIN_RETURNS = 3  # If the other stream is longer, it becomes the current one after this many further frames.
 
@@ -165,8 +165,8 @@ class SourceStatistics(SourceFields):
         is_direct_succession = follows and self._received_at_repetition == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        # Four recent frames in succession are required, because a link may repeat two or three. It hardly ever repeats
-        # older frames, so two of these are enough.
+        # A link may repeat two or three recent frames, so four are required. Links hardly ever repeat older frames, so
+        # two are enough.
         min_run = 3 if is_near else 1
         if self._late_run >= min_run:
             self._begin_stream(now)
@@ -219,8 +219,8 @@ class SourceStatistics(SourceFields):
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
-        # The sequence numbers between the two streams are not lost frames. max() is needed, because late frames among
-        # them are already subtracted.
+        # No frames were lost between the two streams. If some of these sequence numbers have arrived late, they are
+        # already subtracted, so the difference may be negative.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
         self._other_count = current_count
@@ -240,7 +240,7 @@ class SourceStatistics(SourceFields):
 
 
 class SourceLimit:
-    """Limits the number of senders with separate counters, for all framers that share it.
+    """Limits the number of senders for which framers keep separate counters. Several framers can share a limit.
 
     When the limit is reached, senders that were silent for at least 10 s are dropped.
     """

@@ -143,7 +143,7 @@ def jump(to_item: int, *, repeat: int = -1) -> MissionItem:
 
 
 def jump_tag(tag: int) -> MissionItem:
-    """Set a target for :func:`jump_to_tag` (ArduPilot): 0 to 65,535.
+    """Mark this item as a target for :func:`jump_to_tag` (ArduPilot). ``tag`` is 0 to 65,535.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_JUMP_TAG
     """

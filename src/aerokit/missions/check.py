@@ -32,16 +32,16 @@ _GLOBAL_TEXT = "a global frame: 0, 3, 10, or 5, 6, 11"
 
 
 def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool | None = None) -> None:
-    """Raise InvalidArgument if an item cannot be sent. ``items`` are without home.
+    """Raise InvalidArgument if an item cannot be sent to a vehicle. ``items`` do not include home.
 
-    ``home_is_item_0`` is True for ArduPilot: at most 65,534 items, because home takes the place of one. It is False for
-    other autopilots: no destination at 0°, 0°, which only ArduPilot takes for the current position. It is None for an
-    unknown autopilot: 65,535 items and 0°, 0° are allowed.
+    ``home_is_item_0`` is True for missions of ArduPilot, False for other autopilots, and None if the autopilot is
+    unknown.
     """
     check_count(len(items), home_is_item_0=bool(home_is_item_0))
     for index, item in enumerate(items):
         check_item(item, f"item {index}", mission_type)
         if home_is_item_0 is False and item.command in DESTINATIONS and item.x == item.y == 0:
+            # In an item for ArduPilot, 0°, 0° means the current position.
             raise InvalidArgument(
                 f"item {index} ({item.name}): x, y = 0, 0 is not allowed: only ArduPilot understands it as the current"
                 " position; give a latitude and a longitude"
@@ -50,7 +50,7 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
 
 
 def check_count(count: int, *, home_is_item_0: bool = False) -> None:
-    limit = MAX_ITEMS - 1 if home_is_item_0 else MAX_ITEMS
+    limit = MAX_ITEMS - 1 if home_is_item_0 else MAX_ITEMS  # Home is sent as an item, too.
     if count > limit:
         raise InvalidArgument(f"{count} items are too many: at most {limit} are possible")
 

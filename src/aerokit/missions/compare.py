@@ -37,7 +37,7 @@ FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
 class ItemStorage(Enum):
-    """Where items were stored before they were read back. Comparisons ignore the changes that this storage makes."""
+    """How a vehicle has stored items. Comparisons tolerate the changes that this storage causes."""
 
     WIRE = "wire"
     """Only changes made by MISSION_ITEM_INT: rounding to 32-bit floats, and equivalent frames."""
@@ -49,6 +49,8 @@ class ItemStorage(Enum):
     """Changes made by any of the other three."""
 
 
+# How an autopilot stores the parameters of each command: one letter for each of `FIELDS`, explained in `_stored_as`.
+# Fields without a letter are not stored, except those of a place.
 _ARDUPILOT_FORMS: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # The first string is for Copter, Rover and Sub, the second for Plane.
     MavCmd.NAV_LOITER_UNLIM: ("--r",),
@@ -115,19 +117,19 @@ _ARDUPILOT_FORMS: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_ATTITUDE_TIME: ("usiss",),
 }
 
-_PX4_FORMS: dict[int, tuple[str, ...]] = {
-    MavCmd.NAV_WAYPOINT: ("ff-y",),
-    MavCmd.NAV_LOITER_UNLIM: ("--fy",),
-    MavCmd.NAV_LOITER_TIME: ("f?f?",),
-    MavCmd.NAV_LAND: ("-u-y",),
-    MavCmd.NAV_TAKEOFF: ("---y",),
-    MavCmd.NAV_LOITER_TO_ALT: ("?f-?",),
-    MavCmd.NAV_VTOL_TAKEOFF: ("---y",),
-    MavCmd.NAV_VTOL_LAND: ("---y",),
-    MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: ("u",),
-    MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: ("u",),
-    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: ("f",),
-    MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: ("f",),
+_PX4_FORMS: dict[int, str] = {
+    MavCmd.NAV_WAYPOINT: "ff-y",
+    MavCmd.NAV_LOITER_UNLIM: "--fy",
+    MavCmd.NAV_LOITER_TIME: "f?f?",
+    MavCmd.NAV_LAND: "-u-y",
+    MavCmd.NAV_TAKEOFF: "---y",
+    MavCmd.NAV_LOITER_TO_ALT: "?f-?",
+    MavCmd.NAV_VTOL_TAKEOFF: "---y",
+    MavCmd.NAV_VTOL_LAND: "---y",
+    MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: "u",
+    MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: "u",
+    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: "f",
+    MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: "f",
 }
 
 _PX4_JUMP_FORMS = "sUfffff"
@@ -142,9 +144,9 @@ def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Itera
     number, value = FIELDS.index(field), getattr(item, field)
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         for letters in _ARDUPILOT_FORMS.get(item.command, ("",)):
-            yield from _convert(_letter_at(letters, number), value)
+            yield from _stored_as(_letter_at(letters, number), value)
     if storage in (ItemStorage.PX4, ItemStorage.ANY):
-        yield from _convert(_letter_at(_px4_letters(item), number), value)
+        yield from _stored_as(_letter_at(_px4_letters(item), number), value)
 
 
 def _letter_at(letters: str, number: int) -> str:
@@ -154,12 +156,14 @@ def _letter_at(letters: str, number: int) -> str:
 def _px4_letters(item: MissionItem) -> str:
     if item.frame == MavFrame.MISSION:
         return _PX4_JUMP_FORMS if item.command == MavCmd.DO_JUMP else _PX4_OTHER_FORMS
-    (letters,) = _PX4_FORMS.get(item.command, ("",))
-    return letters
+    return _PX4_FORMS.get(item.command, "")
 
 
-def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the value that is read back after it was stored as ``letter`` says; nothing if it cannot be stored."""
+def _stored_as(letter: str, value: float) -> Iterator[float]:
+    """Yield the value that an autopilot sends back after it has stored ``value`` in this form.
+
+    Yields nothing if the autopilot cannot store the value.
+    """
     if letter == "-":  # not stored
         yield 0.0
     elif letter == "2":  # always 2
@@ -176,11 +180,11 @@ def _convert(letter: str, value: float) -> Iterator[float]:
         if low <= math.trunc(value) <= high:
             yield float(math.trunc(value))
     else:
-        yield from _convert_special(letter, value)
+        yield from _finite_stored_as(letter, value)
 
 
-def _convert_special(letter: str, value: float) -> Iterator[float]:
-    """Yield the stored value for the other letters. ``value`` is finite."""
+def _finite_stored_as(letter: str, value: float) -> Iterator[float]:
+    """Like `_stored_as`, for the other letters and a finite value."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float, whose maximum is 3.4e38
         if abs(value) <= 3.4028234663852886e38:

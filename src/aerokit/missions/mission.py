@@ -32,10 +32,9 @@ class _ItemSequence(Snapshot):
     items: Sequence[MissionItem] = ()
 
     def differences(self, found: Self, storage: ItemStorage = ItemStorage.ANY) -> tuple[str, ...]:
-        """Describe how ``found``, read from a vehicle, differs from this plan; return one text for each difference.
+        """Return one text for each difference between this plan and ``found``, which was read from a vehicle.
 
-        Home is ignored, and so are changes made by the protocol and the autopilot's ``storage``. The result is empty if
-        there is no difference.
+        Home is not compared. Changes that the protocol or the autopilot's ``storage`` makes to items are ignored.
         """
         return plan_differences(self.items, found.items, storage)
 
@@ -49,9 +48,9 @@ class _ItemSequence(Snapshot):
         NaN is accepted where the standard defines it as "not given": headings and reserved parameters.
 
         Args:
-            home_is_item_0: checks more for a known autopilot. True, for missions of ArduPilot: at most 65,534 items,
-                because home takes the place of one. False, for other autopilots: no destination at 0°, 0°, which only
-                ArduPilot takes for the current position.
+            home_is_item_0: True for missions of ArduPilot: at most 65,534 items are allowed, because home is sent as an
+                item, too. False for other autopilots: destinations at 0°, 0° are refused, because only ArduPilot takes
+                them for the current position. None skips both checks.
 
         Raises:
             InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.

@@ -275,7 +275,9 @@ def land(
 ) -> MissionItem:
     """Land at a place, or at the current position if none is given (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground at the place, by default that of home; the altitude of a Position is ignored.
+    Give the altitude of the ground at the place; the default is the altitude of home. The altitude of a Position is
+    ignored.
+
     ``abort_altitude_m`` (0 to 65,535 m) is the altitude to which a plane climbs if it aborts the landing; 0 means the
     altitude in its parameters. ``precision`` requests a precision landing from PX4: 0 no, 1 opportunistic, 2 required.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LAND
@@ -323,8 +325,8 @@ def vtol_land(
 ) -> MissionItem:
     """Land vertically at a place, or at the current position if none is given (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground at the place, by default that of home; the altitude of a Position is ignored.
-    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_LAND
+    Give the altitude of the ground at the place; the default is the altitude of home. The altitude of a Position is
+    ignored. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_LAND
     """
     return place_item(
         MavCmd.NAV_VTOL_LAND,

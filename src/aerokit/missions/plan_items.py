@@ -96,7 +96,7 @@ _MODE_OF_FRAME: dict[int, int] = {
 
 
 def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
-    """Return the items of each entry of ``mission.items``. Jump targets are counted from 0 over all entries."""
+    """Return the items of each entry of ``mission.items``. Jumps have the index of their target among all items."""
     groups = [_simple_values(entry) for entry in entries]  # None for a landing pattern, whose items are generated
     landings = {number: landing_items(entries[number]) for number, group in enumerate(groups) if group is None}
     sizes = [len(landings[number]) if group is None else len(group) for number, group in enumerate(groups)]
@@ -113,9 +113,10 @@ def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
 def merged_entries(
     entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
 ) -> list[Any]:
-    """Return the entries of ``mission.items`` in a .plan file for ``items``.
+    """Return the new entries of ``mission.items`` in a .plan file, so that they contain ``items``.
 
-    Old ``entries`` at the beginning and at the end are kept if their items (``groups``) are unchanged.
+    ``entries`` are the old entries, and ``groups`` their items. Old entries at the beginning and at the end are kept if
+    their items are unchanged.
     """
     targets = {item.param1 for item in items if item.command == MavCmd.DO_JUMP}
 
@@ -191,8 +192,8 @@ def _jump_ids(
 ) -> dict[int, int]:
     """Map each doJumpId in a .plan file to the index of the mission item that has this id.
 
-    For each entry, ``groups`` has its simple items (None for a landing pattern), and ``sizes`` its number of mission
-    items.
+    The three arguments describe the same entries: ``groups`` are their simple items (None for a landing pattern), and
+    ``sizes`` their numbers of mission items.
     """
     ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}

@@ -109,9 +109,9 @@ def unscaled_xy(item: MissionItem) -> tuple[float, float]:
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Convert degrees, metres of a local frame, or an unscaled parameter, to ``x`` or ``y``.
+    """Return the ``x`` or ``y`` of an item for degrees, for metres in a local frame, or for an unscaled parameter.
 
-    This is the inverse of :func:`unscaled_xy`. Only unscaled parameters can have a fraction afterwards.
+    This is the inverse of :func:`unscaled_xy`. Degrees and metres are rounded to an integer.
     """
     if math.isnan(value):
         return DEFAULT_XY
@@ -154,8 +154,8 @@ def shift_jumps(items: Iterable[MissionItem], offset: int) -> tuple[MissionItem,
 def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
     """Convert the items of a mission that was made for ArduPilot, so that another autopilot accepts them.
 
-    ``here`` is the current position (latitude and longitude in degrees), for a destination at 0°, 0°. If it is None,
-    0°, 0° is kept, and `check_items` refuses the mission.
+    A first destination at 0°, 0° is replaced by ``here``, the current position (latitude and longitude in degrees). If
+    ``here`` is None, 0°, 0° is kept, and `check_items` refuses the mission.
     """
     current_xy: tuple[int, int] | None = None
     if here is not None:
@@ -166,7 +166,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
-            # In ArduPilot, 0°, 0° means the current position, which is the last destination before this item.
+            # In ArduPilot, 0°, 0° means the current position. During the mission, this is the previous destination.
             if current_xy is not None and item.x == item.y == 0:
                 x, y = current_xy
                 item = item.replace(x=x, y=y)
@@ -245,9 +245,9 @@ def read_header(data: bytes) -> PlanHeader:
 
 
 def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
-    """Decode all items of a packed plan. The first has the number ``first_index`` of the header.
+    """Decode all items of a packed plan. In a mission of ArduPilot, item 0 is home.
 
-    In a mission of ArduPilot, the item with number 0 is home. Raises RemoteProtocolError if the data is not a complete
+    The header says which item is the first (``first_index``). Raises RemoteProtocolError if the data is not a complete
     packed plan of this type.
     """
     header = read_header(data)

@@ -116,7 +116,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # The next iteration polls if that is due. If there is no timer, it runs the event sources again.
+            # Nothing to run. The next iteration polls if a poll is due, and otherwise runs the event sources again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             # Otherwise, the next event is a timer.
@@ -162,8 +162,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 if due < earliest_due:
                     earliest_due = due
                     earliest_handle = handle
-            # Stop if a timer is due earlier or at the same instant. The iteration that runs the timer also runs the
-            # event sources of its instant.
+            # Stop if the next timer is due earlier or at the same instant. The loop runs the event sources of that
+            # instant together with the timer.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)

@@ -18,7 +18,7 @@ _MAX_SECONDS = 3600.0
 class FaultModel(Snapshot):
     """Faults of one direction of a radio link. By default, there are no faults.
 
-    A share is the probability (0 to 1) that a frame has the fault, drawn separately for each frame and each fault.
+    Shares are probabilities from 0 to 1. Each fault is drawn for each frame, independently of other faults.
 
     Raises InvalidArgument for a value out of range.
     """

@@ -42,8 +42,9 @@ class StalledQueue:
     """Simulates a TCP connection that is stalled until `drain`.
 
     The simulated operating system accepts the first ``system_bytes``. Further bytes wait in an `Outbox` per peer.
-    ``carry(data, peer)`` sends bytes. ``on_drop`` is called with the number of writes that an outbox drops.
-    When an outbox stalls or drains, ``on_stall`` is called with True if any outbox is now stalled, otherwise False.
+
+    ``carry(data, peer)`` sends bytes. ``on_drop(count)`` is called when an outbox drops writes.
+    ``on_stall(is_any_stalled)`` is called when an outbox stalls or drains.
     """
 
     def __init__(
@@ -164,8 +165,8 @@ class FaultyLink(Link):
         self._stalled_queue: StalledQueue | None = None  # None before the first call of `stall`
         self._stalled_at: float | None = None  # start of the present stall; None if there is none
         self._expired_writes = 0
-        self._drained = asyncio.Event()  # not set while a closed link still delivers frames
-        self._drained.set()
+        self._delivered = asyncio.Event()  # not set while a closed link still delivers frames
+        self._delivered.set()
 
     @property
     def address(self) -> str:  # type: ignore[override]
@@ -174,7 +175,7 @@ class FaultyLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """Number of writes that the wrapped link or a stall dropped, and of frames that overflowed `outgoing`.
+        """Number of writes dropped by the wrapped link, by a stall or by the full queue of `outgoing`.
 
         Frames that were lost in transit do not count.
         """
@@ -277,13 +278,13 @@ class FaultyLink(Link):
         if in_flight is None or in_flight.loop.is_closed() or in_flight.is_empty:  # There is nothing left to deliver.
             self.link.close()
             return
-        self._drained.clear()
+        self._delivered.clear()
         latest_close = in_flight.loop.time() + LINGER_S
         in_flight.put(min(in_flight.latest_due, latest_close), self._close_link)
 
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
-        await self._drained.wait()
+        await self._delivered.wait()
         await self.link.wait_closed()
 
     def _count_expired(self, writes: int) -> None:
@@ -307,7 +308,7 @@ class FaultyLink(Link):
             self._stalled_queue.close()
         if self._in_flight is not None:
             self._in_flight.clear()
-        self._drained.set()
+        self._delivered.set()
 
     def _close_link(self) -> None:
         self._discard_in_transit()
@@ -415,8 +416,8 @@ class _DeliveryQueue:
                     break
                 heappop(self._waiting)
                 action()
-        finally:  # The other actions run even if one raises an exception. The event loop reports it.
-            # If an action has called `put`, the new timer may be for an action that has already run.
+        finally:  # If an action raises an exception, the event loop reports it, and a new timer runs the other actions.
+            # An action may have called `put`, which started a timer. The timer's own action may have run meanwhile.
             if self._timer is not None:
                 self._timer.cancel()
                 self._timer = None

@@ -15,7 +15,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 @dataclass(frozen=True)
 class SentText:
-    """A status text that the vehicle sent, joined if it was sent in chunks. It may have been lost in transit."""
+    """A status text that the vehicle sent, joined from its chunks. The text may have been lost in transit."""
 
     time_s: float
     """Simulated seconds."""

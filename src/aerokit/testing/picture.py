@@ -202,7 +202,7 @@ class _Axes:
         for value in _ticks(self.y_range, max_y_intervals):
             _, y = self.place(0.0, value)
             shapes.append(_GridLine((self.left, y), (right, y)))
-            # The text is 5 pixels left of the axis. Its baseline is 4 pixels below the grid line, to centre it there.
+            # The text ends 5 pixels left of the axis. With its baseline 4 pixels lower, it is centred on the grid line.
             shapes.append(_Text(self.left - 5, y + 4, f"{value:g} {y_unit}", "end"))
         return shapes
 

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 _MARKER = "simulated"
 _PICTURES_OPTION = "--flight-pictures"
-# Attribute of a test function that pytest-asyncio runs. It holds a function that opens the flights and calls the test.
+# Name of an attribute of test functions that pytest-asyncio runs. Its value is a function that opens the flights and
+# calls the test.
 _TEST_WITH_OPEN_FLIGHTS = "_aerokit_test_with_open_flights"
 # The plugin compares names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
@@ -140,7 +141,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
-    """Open ``flight`` and ``fleet`` around an ``async def`` test, and run it if there is no async plugin."""
+    """Open the fixtures ``flight`` and ``fleet`` around an ``async def`` test. Run the test if no async plugin does."""
     # A test with `served_flight` fails as soon as the simulated vehicle raises an exception.
     with _function_replaced(pyfuncitem, _runnable_function(pyfuncitem)), _raising_vehicle_errors(pyfuncitem):
         return (yield)

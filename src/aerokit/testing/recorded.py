@@ -133,8 +133,10 @@ class RecordedMissions(MissionServer):
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
         kind = message.mission_type
-        is_upload = isinstance(message, m.MissionCount)
-        is_recorded = kind in self._vehicle.recording.uploads if is_upload else self.items(kind) is not None
+        if isinstance(message, m.MissionCount):  # an upload
+            is_recorded = kind in self._vehicle.recording.uploads
+        else:
+            is_recorded = self.items(kind) is not None
         return None if is_recorded else MavMissionResult.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
@@ -173,7 +175,7 @@ class RecordedMissions(MissionServer):
         """Do nothing: the recording decides which item is current."""
 
     def _recorded_result(self, request: str, results: list[int], mission_type: int) -> int:
-        """Return the next of the recorded results. The last one repeats."""
+        """Return the next of the recorded results. After the last one, return it again."""
         number = self._result_counts.get((request, mission_type), 0)
         self._result_counts[request, mission_type] = number + 1
         return results[min(number, len(results) - 1)]
@@ -201,11 +203,11 @@ class RecordedVehicle(SimulatedVehicle):
     """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
     - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
-      other params. Their delays are those of the recording. A repeated command gets the recorded answers in turn, and
-      then always the last. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the latest played
-      message of this type or, if none was played yet, the first in the recording.
+      other params, each after its recorded delay. If a command is repeated, it gets the next recorded answer; after the
+      last one, it gets the last one again. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the
+      latest played message of this type or, if none was played yet, the first in the recording.
     - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
-      recording can be set. A request for another parameter gets PARAM_ERROR if the recorded vehicle ever sent
+      recording can be set. A request for an unknown parameter gets PARAM_ERROR if the recorded vehicle ever sent
       PARAM_ERROR, otherwise no answer.
     - Missions: the vehicle has the recorded missions. An upload or a clearing gets the recorded result or, if there is
       none, UNSUPPORTED.
@@ -240,7 +242,8 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        # Number of answers sent from each list of recorded answers. The `id()`s of its answers identify a list.
+        # Maps lists of recorded answers to the number of answers that were sent. A list is identified by the `id()`s of
+        # its answers.
         self._answered_counts: dict[tuple[int, ...], int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""

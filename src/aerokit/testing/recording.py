@@ -78,7 +78,7 @@ class RecordedFlight:
 
     def __init__(self, source: str | PathLike[str] | BinaryIO, system_id: int | None = None) -> None:
         frames = _frames(source)
-        self.system_id, self.component_id = _autopilot(frames, system_id)
+        self.system_id, self.component_id = _find_autopilot(frames, system_id)
         self.stream: list[tuple[float, Frame]] = []
         """Frames that the vehicle sent without a request, with their times, in order."""
         self.answers: dict[int, list[RecordedAnswer]] = {}
@@ -216,8 +216,8 @@ def _frames(source: str | PathLike[str] | BinaryIO) -> list[tuple[float, Frame]]
     return frames
 
 
-def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tuple[int, int]:
-    """Return system id and component id of the first autopilot, or of the one with this system id."""
+def _find_autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tuple[int, int]:
+    """Return the system id and the component id of the first autopilot. Look only for ``system_id`` if it is given."""
     for _, frame in frames:
         if frame.message_id != m.Heartbeat.ID or system_id not in (None, frame.system_id):
             continue

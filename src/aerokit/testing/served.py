@@ -72,7 +72,7 @@ class ServedFlight:
         failure = self._server.failure
         if failure is not None:
             self._is_raised = True
-            # With "from", the traceback does not show the exception that ended the block, such as KeyboardInterrupt.
+            # Without "from", the traceback would also show the exception that ended the block, e.g. KeyboardInterrupt.
             raise failure from failure.__cause__
 
     @contextmanager

@@ -7,7 +7,7 @@ import math
 import re
 from argparse import ArgumentTypeError
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit._internal import geo
 from aerokit.apps.cli.completion import assignments, set_completions
@@ -108,11 +108,16 @@ TRANSMITTER_ON_S = 1.0
 """Earliest time of the fault ``rc_lost``, because ArduPilot ignores a transmitter that it has never received."""
 
 
-def fault(text: str) -> tuple[str, bool | float | list[str], float]:
-    """Parse ``NAME[=VALUE][@SECONDS]`` into the name, the value and the time of a simulated fault.
+class FaultOption(NamedTuple):
+    """A fault given on the command line. ``at_s`` is its start in simulated seconds."""
 
-    The time is in simulated seconds.
-    """
+    name: str
+    value: bool | float | list[str]
+    at_s: float
+
+
+def fault(text: str) -> FaultOption:
+    """Parse ``NAME[=VALUE][@SECONDS]``."""
     name_and_value, _, begin_text = text.partition("@")
     name, equals, value = name_and_value.partition("=")
     if name not in FAULTS:
@@ -123,14 +128,14 @@ def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     if name in _SHARE_FAULTS:
         if not value:
             raise ArgumentTypeError(f"{name} needs the share of frames to lose: {name}=0.2")
-        return name, number(0, 1)(value), at_s
+        return FaultOption(name, number(0, 1)(value), at_s)
     if name == "prearm_failures":
         if not value:
             raise ArgumentTypeError("prearm_failures needs a reason: 'prearm_failures=Compass not healthy'")
-        return name, [value], at_s
+        return FaultOption(name, [value], at_s)
     if equals:
         raise ArgumentTypeError(f"{name} takes no value; {name}@5 begins after 5 simulated seconds")
-    return name, True, at_s
+    return FaultOption(name, True, at_s)
 
 
 def wind(text: str) -> tuple[float, ...]:

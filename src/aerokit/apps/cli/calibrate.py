@@ -150,7 +150,7 @@ async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:
 
 
 class Display:
-    """Prints the pictures of poses, the instructions and the progress, in at most 80 columns and 24 lines at a time."""
+    """Prints the steps of a calibration. A step takes at most 80 columns and 24 lines."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options

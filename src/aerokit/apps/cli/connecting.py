@@ -101,9 +101,9 @@ def add_address(
 ) -> None:
     """Add an argument or option for the address of a link, and ``--baud``.
 
-    ``name`` has leading dashes if the address is an option. ``what`` is the beginning of its help text.
-    ``default_text`` says in the help what the command does without an address. If it is None, the command uses the
-    default address.
+    ``name`` has leading dashes if the address is an option. The help text begins with ``what``. It ends with
+    ``default_text``, which says what the command does without an address. If ``default_text`` is None, the command uses
+    the default address.
     """
     keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
     if default_text is None:
@@ -161,10 +161,7 @@ def add_action(
     *,
     connects: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add the action ``name`` to a command.
-
-    With ``connects``, it also has the options for a connection to a vehicle.
-    """
+    """Add the action ``name`` to a command. With ``connects``, include the options for a connection to a vehicle."""
     parents = [_vehicle_parser()] if connects else []
     summary = text[0].lower() + text[1:].partition(". ")[0].rstrip(".")
     action = actions.add_parser(name, help=summary, description=text, parents=parents)
@@ -191,11 +188,10 @@ def command_action(
     action: Callable[[Any, argparse.Namespace], Awaitable[object]],
     open_target: Callable[[argparse.Namespace], AbstractAsyncContextManager[Any]] | None = None,
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
-    """Return a ``run`` function that performs one action and prints one line.
+    """Return the ``run`` function of a command that performs one action and then prints one line.
 
-    ``name`` is the action in the ``done`` record, and ``text`` the line without ``--json``. Both may contain names of
-    options in braces. ``action`` is called with the target and the options. Without ``open_target``, the target is the
-    vehicle.
+    The line is ``text``, or with ``--json`` a ``done`` record with ``name``. Options named in braces are replaced in
+    both. ``action`` is called with a target and the options; the target is the vehicle, or what ``open_target`` yields.
     """
 
     async def run(options: argparse.Namespace) -> int:

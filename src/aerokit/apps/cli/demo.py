@@ -122,7 +122,7 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
 
 
 class _SquareFlight(SupervisedFlight):
-    """A flight along a square. After an interrupt or a failure it lands, unless another party has control."""
+    """A flight along a square. After an interrupt or a failure, the vehicle lands, unless another party has control."""
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack) -> None:
         super().__init__(vehicle, report, interrupts, "land")

@@ -144,7 +144,7 @@ def _printable_text(text: str) -> str:
 
 
 def _file_name(capture: Capture) -> str | None:
-    """Return a file name such as ``00003-IMG_3.JPG``; None if the camera's name is not valid on every system."""
+    """Return a file name such as ``00003-IMG_3.JPG``; None if the camera's name is not portable."""
     name = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
     is_portable = name.isprintable() and not set(name) & set('/\\:*?"<>|') and name.strip(" .") == name
     return f"{capture.index:05}-{name}" if is_portable and len(name) <= _MAX_FILE_NAME else None

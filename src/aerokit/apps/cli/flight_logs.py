@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-# What `Conversion.written` counts, by the suffix of the file; rows for other suffixes. An .mcap has more messages than
-# the log has entries, because it also has a message for each changed state.
+# What `Conversion.written` counts for each suffix; for other suffixes, it counts rows. An .mcap file has more messages
+# than the log has entries, because each changed state is a message, too.
 _WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 _REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 

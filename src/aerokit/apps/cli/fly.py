@@ -187,8 +187,8 @@ class PlanFlight(SupervisedFlight):
         return DONE
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # Modes for landing and returning are not included, because a failsafe may have set them. The mode for holding
-        # is included only before the start, because a cancelled start of the mission ends in this mode.
+        # "land" and "return" are missing, because a failsafe may have set these modes. "hold" is included only before
+        # the start of the mission, because a cancelled start ends in this mode.
         return ("mission",) if self._has_changed_mode else ("mission", "hold")
 
 

@@ -83,10 +83,7 @@ def _messages(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _rate(text: str) -> tuple[str, dict[str, float]]:
-    """Parse ``MESSAGE=HZ,…[@NAME]`` into the endpoint and the rates of messages.
-
-    The endpoint is "" for all endpoints.
-    """
+    """Parse ``MESSAGE=HZ,…[@ENDPOINT]`` into the endpoint ("" for all) and the rate of each message."""
     endpoint, parts = _messages(text)
     rates = {}
     for part in parts:

@@ -102,15 +102,12 @@ async def _record_link(options: argparse.Namespace) -> int:
 
 
 async def _wait_for_end(connection: Connection, options: argparse.Namespace) -> bool:
-    """Wait for the end of the recording. Return True after Ctrl-C.
-
-    Without ``--as-is``, message rates are requested meanwhile.
-    """
+    """Wait for the end of the recording. Return True after Ctrl-C."""
     if options.as_is:
         return await await_end(connection, options.seconds)
     from aerokit.vehicle.connect import vehicles_on
 
-    async with vehicles_on(connection):
+    async with vehicles_on(connection):  # This requests message rates from each vehicle.
         return await await_end(connection, options.seconds)
 
 

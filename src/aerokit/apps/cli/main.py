@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 ARGCOMPLETE_VARIABLE = "_ARGCOMPLETE"
 """Name of the environment variable that the shell sets when it asks argcomplete for completions."""
-# `aerokit run PROGRAM ARGUMENTS…` is not parsed by argparse here, because the arguments belong to the program.
+# The parser of this module does not parse `aerokit run PROGRAM ARGUMENTS…`, because the arguments are the program's.
 RUN = "run"
 
 
@@ -40,7 +40,7 @@ RUN = "run"
 class CliCommand:
     """A subcommand, ``aerokit NAME``. Its module is imported only when the command is called.
 
-    ``location`` is ``"module"`` or ``"module:function"`` in `aerokit.apps.cli`; the default function is
+    ``location`` names a function in `aerokit.apps.cli`: ``"module:function"``, or ``"module"`` for its function
     ``add_arguments``. The function adds the command's arguments to a parser. It also sets ``run``: a coroutine function
     that takes the parsed options and returns the exit code. The first sentence of ``description`` appears in the list
     of commands.
@@ -204,7 +204,7 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
 
-# Actions that users may try as commands. Vehicles have methods for them, but the command line does not.
+# Actions that users may try as commands. The command line does not have them.
 _ARMING_WORDS = ("arm", "disarm", "takeoff", "take_off", "take-off", "land", "goto", "go_to", "rtl")
 
 

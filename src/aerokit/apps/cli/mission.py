@@ -114,7 +114,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
         count = len(content.to_items())
         if count == 0:
             continue
-        with progress_bar(part, None) as on_progress:  # None, because the unit may be items or, over MAVFTP, bytes
+        with progress_bar(part, unit=None) as on_progress:  # MAVFTP reports progress in bytes instead of items.
             try:
                 await getattr(vehicle, part).upload(
                     content,
@@ -270,7 +270,7 @@ def _emit_warnings(plan: Plan, options: argparse.Namespace) -> list[str]:
 
 
 def _notes(plan: Plan) -> list[str]:
-    """Return a note if only ArduPilot accepts the items, and the plan does not say that it is for ArduPilot."""
+    """Return a note if only ArduPilot accepts the mission, unless the plan is marked as a plan for ArduPilot."""
     if plan.firmware_type == MavAutopilot.ARDUPILOTMEGA:
         return []
     try:
@@ -289,5 +289,5 @@ async def _clear(options: argparse.Namespace) -> int:
 
 
 async def _download_part(vehicle: Vehicle, part: str, options: argparse.Namespace) -> Any:
-    with progress_bar(part, None) as on_progress:
+    with progress_bar(part, unit=None) as on_progress:
         return await getattr(vehicle, part).download(idle_timeout_s=options.patience, on_progress=on_progress)

@@ -159,8 +159,8 @@ _CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))
 def plain_text(error: BaseException) -> str:
     """Return the text of an error in the words of the command line.
 
-    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Reasons
-    that only announce a mission item, such as ``Mission: 3 WP``, are left out.
+    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Status
+    texts about mission items, such as ``Mission: 3 WP``, are removed.
     """
     text = _MISSION_REASON.sub("", str(error))
     call = _CALL.match(text)
@@ -315,9 +315,9 @@ def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Check that a recording can be written, and remove the file after the block if it is new and empty.
+    """Check that a recording can be written to ``path``. After the block, remove the file if it is new and empty.
 
-    None stands for no recording. Raises PermissionError if the folder is not writable.
+    Do nothing if ``path`` is None. Raises PermissionError if the folder is not writable.
     """
     if path is None:
         yield

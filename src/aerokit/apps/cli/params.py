@@ -269,16 +269,16 @@ async def _known_names(vehicle: Vehicle) -> Collection[str]:
     return ()
 
 
-def _with_hint(name: str, error: Exception, known: Collection[str]) -> str:
-    """Return the text of an error, with similar names if the vehicle does not have the parameter."""
+def _with_hint(name: str, error: Exception, known_names: Collection[str]) -> str:
+    """Return the text of an error. If the vehicle does not have the parameter, add similar ``known_names``."""
     text = str(error)
     # A text with "replaced by" or "its name on" already contains the right name.
     if not _is_unknown_name(error) or "replaced by" in text or "its name on" in text:
         return text
     # The error's own suggestions are replaced, because they include only parameters that were already read.
     bare_text, _, _ = text.partition(" (did you mean")
-    beginnings = [other for other in known if len(other) >= _MIN_BEGINNING and name.upper().startswith(other)]
-    names = dict.fromkeys([*beginnings, *near_names(name, known, 3)])
+    beginnings = [known for known in known_names if len(known) >= _MIN_BEGINNING and name.upper().startswith(known)]
+    names = dict.fromkeys([*beginnings, *near_names(name, known_names, 3)])
     hint = " or ".join(map(repr, list(names)[:3]))
     return f"{bare_text} (did you mean {hint}?)" if hint else f"{bare_text}; `aerokit params list` shows all names"
 
@@ -294,12 +294,14 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
 
 
 def _emit_results(
-    options: argparse.Namespace, results: Iterable[ParameterWrite], known: Collection[str], metadata: Metadata | None
+    options: argparse.Namespace,
+    results: Iterable[ParameterWrite],
+    known_names: Collection[str],
+    metadata: Metadata | None,
 ) -> int:
     """Print a line for each result, and return the exit code.
 
-    ``known`` are names for suggestions. The exit code is not DONE if a parameter was not set, or if the vehicle
-    clamped its value.
+    The exit code is not DONE if a parameter was not set, or if the vehicle clamped its value.
     """
     code = DONE
     for result in results:
@@ -311,7 +313,7 @@ def _emit_results(
             value = _text(result.value) if shows_one_value else f"{_text(result.before)} → {_text(result.value)}"
             text = f"{result.name:16} {value:<12} {result.outcome} {result.note}".rstrip()
         else:
-            text = f"{result.name:16} not set: {_with_hint(result.name, result.error, known)}"
+            text = f"{result.name:16} not set: {_with_hint(result.name, result.error, known_names)}"
         emit(options, "parameter_write", _record(result), text)
         if result.error is not None and code in (DONE, FAILED):
             code = exit_code(result.error)

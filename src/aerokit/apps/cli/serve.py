@@ -165,12 +165,12 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
 
 
 def _server_class(uvicorn: Any) -> Any:
-    """Return a uvicorn server class without signal handlers, which calls its ``on_started`` with the port."""
+    """Return a subclass of uvicorn's Server. It calls ``on_started(port)``, and does not handle signals."""
 
     class Server(uvicorn.Server):  # type: ignore[misc]
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
-            yield  # uvicorn's signal handlers are not installed, because the command handles signals
+            yield  # The command handles signals itself.
 
         async def startup(self, sockets: Any = None) -> None:
             await super().startup(sockets=sockets)

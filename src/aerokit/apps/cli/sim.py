@@ -6,7 +6,7 @@ import asyncio
 import inspect
 import shlex
 from contextlib import asynccontextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.apps.cli.arguments import (
     DEFAULT_SIM_ADDRESS,
@@ -87,8 +87,8 @@ def simulated_fleet(
 ) -> list[SimulatedVehicle]:
     """Create ``count`` vehicles with consecutive system ids and seeds, in a row eastwards from ``home``.
 
-    ``components`` makes the components of one vehicle. ``name`` is the kind of vehicle or the path of a recording. A
-    recording needs a ``count`` of 1, and ignores the other arguments.
+    ``components`` makes the components of one vehicle. ``name`` is the kind of vehicle or the path of a recording. For
+    a recording, ``count`` must be 1, and the other arguments are ignored.
     """
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
@@ -191,16 +191,22 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_json(command)
 
 
-# Maps options to the maximum number of devices, the function that makes a device from its number (from 0), and a
-# description.
-_DEVICES: dict[str, tuple[int, Callable[[int], AttachableComponent], str]] = {
-    "camera": (6, lambda number: SimulatedCamera(100 + number), "camera (component 100 to 105)"),
-    "gimbal": (
+class _DeviceOption(NamedTuple):
+    """An option that adds a device to each vehicle. ``make`` takes the number of the device, counted from 0."""
+
+    max_count: int
+    make: Callable[[int], AttachableComponent]
+    description: str
+
+
+_DEVICES: dict[str, _DeviceOption] = {
+    "camera": _DeviceOption(6, lambda number: SimulatedCamera(100 + number), "camera (component 100 to 105)"),
+    "gimbal": _DeviceOption(
         6,
         lambda number: SimulatedGimbal(170 + number if number else 154),
         "gimbal (component 154, 171 to 175)",
     ),
-    "companion": (
+    "companion": _DeviceOption(
         4,
         lambda number: ExtraComponent(MavComponent.ONBOARD_COMPUTER + number, MavType.ONBOARD_CONTROLLER),
         "companion computer (component 191 to 194), which sends heartbeats",
@@ -209,22 +215,22 @@ _DEVICES: dict[str, tuple[int, Callable[[int], AttachableComponent], str]] = {
 
 
 def _add_devices(command: argparse.ArgumentParser) -> None:
-    for name, (max_count, _, text) in _DEVICES.items():
+    for name, device in _DEVICES.items():
         command.add_argument(
             f"--{name}",
             action="count",
             default=0,
-            help=f"fit each vehicle with a {text}; repeatable, up to {max_count}",
+            help=f"fit each vehicle with a {device.description}; repeatable, up to {device.max_count}",
         )
 
 
 def _devices(options: argparse.Namespace) -> list[AttachableComponent]:
     components = []
-    for name, (max_count, make_device, _) in _DEVICES.items():
+    for name, device in _DEVICES.items():
         count = getattr(options, name)
-        if count > max_count:
-            raise InvalidArgument(f"--{name} is given {count} times, but a vehicle has at most {max_count}")
-        components += [make_device(number) for number in range(count)]
+        if count > device.max_count:
+            raise InvalidArgument(f"--{name} is given {count} times, but a vehicle has at most {device.max_count}")
+        components += [device.make(number) for number in range(count)]
     return components
 
 
@@ -262,7 +268,7 @@ async def injecting_faults(vehicles: Sequence[SimulatedVehicle], options: argpar
 async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:
     loop = asyncio.get_running_loop()
     started_at = loop.time()
-    for name, value, at_s in sorted(options.faults, key=_begin_of):
+    for name, value, at_s in sorted(options.faults, key=lambda fault: fault.at_s):
         await asyncio.sleep(started_at + at_s / options.speedup - loop.time())
         for vehicle in vehicles:
             if isinstance(value, list):
@@ -271,11 +277,6 @@ async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namesp
                 setattr(vehicle.faults, name, value)
         begin = f"{at_s:g} s" if at_s else "from the start"
         emit(options, "fault", {"name": name, "value": value, "seconds": at_s}, f"{begin}: fault {name}")
-
-
-def _begin_of(fault: tuple[str, object, float]) -> float:
-    _, _, at_s = fault
-    return at_s
 
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:

@@ -38,7 +38,7 @@ _REQUESTED = (
     ("batteries", BatteryStatus),
     ("position", GlobalPositionInt),
 )
-# How long to wait for the restoration of changed stream rates before the connection is closed.
+# How long to keep the connection open at the end, so that aerokit can restore the stream rates that it has changed.
 _RESTORE_RATES_S = 0.5
 # How long to wait for a requested message after the vehicle has accepted the request.
 _MESSAGE_TIMEOUT_S = 0.3
@@ -83,7 +83,7 @@ def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
 
 def _readiness(vehicle: Vehicle, checks: Readiness) -> list[str]:
     lines = readiness_lines(vehicle, checks)
-    if lines and vehicle.armed.latest:  # these are not reasons against arming, because the vehicle is armed
+    if lines and vehicle.armed.latest:  # The words of `lines` are for a disarmed vehicle.
         return _aligned("missing", [*checks.against_arming, *checks.against_flight])
     if lines:
         return _aligned("arming", [text.replace("arm() changes to", "aerokit changes to") for text in lines])

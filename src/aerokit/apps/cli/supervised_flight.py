@@ -416,29 +416,31 @@ class FlightReport:
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"
 
     async def _print_status(self) -> None:
-        vehicle = self._vehicle
-        while vehicle.connection.is_open:
+        connection = self._vehicle.connection
+        while connection.is_open:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)
-            if not self.prints_status or vehicle.connection.now() - self._last_line_at < _STATUS_INTERVAL_S:
-                continue
-            if vehicle.heartbeat_age > SILENT_AFTER_S:
-                here = vehicle.position.latest
-                height = None if here is None else here.altitude_relative_m
-                last = "" if height is None else f" at {height:.1f} m"
-                seconds = self.speedup * vehicle.heartbeat_age
-                self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
-                continue
-            checks = None if vehicle.is_armed else readiness(vehicle, changes_mode=True)
-            if checks is not None and checks.against_arming:  # "cannot arm yet: …" or "not known whether it arms: …"
+            is_due = connection.now() - self._last_line_at >= _STATUS_INTERVAL_S
+            if self.prints_status and is_due:
+                self.print_line(f"  {self._status_text()}")
+
+    def _status_text(self) -> str:
+        vehicle = self._vehicle
+        if vehicle.heartbeat_age > SILENT_AFTER_S:
+            here = vehicle.position.latest
+            height = None if here is None else here.altitude_relative_m
+            last = "" if height is None else f" at {height:.1f} m"
+            seconds = self.speedup * vehicle.heartbeat_age
+            return f"silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}"
+        if not vehicle.is_armed:
+            checks = readiness(vehicle, changes_mode=True)
+            if checks.against_arming:  # "cannot arm yet: …" or "not known whether it arms: …"
                 yet = " yet" if checks.is_known else ""
-                reasons = "; ".join([*checks.against_arming, *checks.against_flight])
-                self.print_line(f"  {checks.prefix}{yet}: {reasons}")
-            elif checks is not None and checks.against_flight:
-                self.print_line(f"  {arms_but_cannot_fly_text(vehicle)}: {'; '.join(checks.against_flight)}")
-            else:
-                speed = vehicle.ground_speed_m_s
-                is_known = speed.age <= SILENT_AFTER_S
-                self.print_line(f"  {vehicle.mode_name}, {f'{speed.value:.1f} m/s' if is_known else 'speed unknown'}")
+                return f"{checks.prefix}{yet}: {'; '.join([*checks.against_arming, *checks.against_flight])}"
+            if checks.against_flight:
+                return f"{arms_but_cannot_fly_text(vehicle)}: {'; '.join(checks.against_flight)}"
+        speed = vehicle.ground_speed_m_s
+        speed_text = f"{speed.value:.1f} m/s" if speed.age <= SILENT_AFTER_S else "speed unknown"
+        return f"{vehicle.mode_name}, {speed_text}"
 
     def _on_velocity(self, _: Velocity | None, velocity: Velocity) -> None:
         if velocity.down_m_s >= IMPACT_M_S:

@@ -156,7 +156,7 @@ class InterruptStack:
 async def waiting(
     options: argparse.Namespace, address: str, seconds: float, what: str = "a heartbeat"
 ) -> AsyncIterator[None]:
-    """Show a countdown on stderr within the block.
+    """Within the block, show a countdown of ``seconds`` on stderr, such as "waiting for a heartbeat on COM3 … 9 s".
 
     Nothing is shown with ``--json`` or without a terminal.
     """

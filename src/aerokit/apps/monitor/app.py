@@ -195,7 +195,7 @@ class Monitor(App[None]):
         self.set_interval(REFRESH_INTERVAL_S, self.update_view)
 
     def on_resize(self, event: Resize) -> None:
-        """Adapt the layout to the terminal: if it is wide, rates are below the state, and texts below the map."""
+        """Adapt the layout. In a wide terminal, the rates are below the state, and the texts are below the map."""
         base = self.screen_stack[0]
         base.set_class(event.size.height >= TALL_ROWS, "tall")
         min_columns, min_rows = WIDE_SIZE

@@ -85,7 +85,7 @@ class VehicleText:
             width = columns - max(len(label) for label, _ in rows) - _LABEL_PADDING
             unused_lines = lines - len(rows)
             label = "missing" if self._failsafe is None else "failsafe"
-            # The second row shows only one reason. Replace it by all reasons that fit, an active failsafe first.
+            # The second row shows only one reason that prevents a flight. Replace it by all reasons that fit.
             rows[1] = (label, self._missing(1 + unused_lines, width))
         return rows
 
@@ -298,7 +298,7 @@ class Canvas:
         norths, easts = zip(*all_points, strict=True)
         self._middle_north = (max(norths) + min(norths)) / 2
         self._middle_east = (max(easts) + min(easts)) / 2
-        # Each Braille character has two columns and four rows of dots. One character is a margin at the edges.
+        # Each Braille character has two columns and four rows of dots. One column and one row of characters stay free.
         width_dots = 2 * (self._columns - 1)
         height_dots = 4 * (self._rows - 1)
         self._metres_per_dot: float = max(

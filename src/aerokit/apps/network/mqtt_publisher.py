@@ -241,9 +241,8 @@ class MqttLink(BaseLink):
         if self._timer is not None:
             self._timer.cancel()
         if client is not None and client.socket() is not None:
-            # If the client is not connected or has unsent data, no DISCONNECT is sent, and the broker publishes
-            # "offline" itself (will_set).
-            if client.is_connected() and not client.want_write():
+            can_send_now = client.is_connected() and not client.want_write()
+            if can_send_now:
                 client.publish(self._alive_topic, b"offline", retain=True)
                 client.disconnect()
             _close_socket(client)

@@ -132,7 +132,7 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# With wait=false, the response is sent after this time, or sooner with the reason if the order is refused.
+# With wait=false, the server responds after this time, or as soon as the order is refused.
 _REFUSAL_TIMEOUT_S = 0.2
 
 
@@ -257,8 +257,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One HTTP method of one path.
 
-    ``name`` is the operationId. ``order`` is the type of the order that the operation gives. ``body_type`` is the type
-    of an order whose arguments the operation only checks.
+    ``name`` is the operationId. ``order`` is the type of order that the operation gives to a vehicle. An operation that
+    only checks the arguments of an order has ``body_type`` instead.
     """
 
     method: str

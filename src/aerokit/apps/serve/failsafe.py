@@ -14,7 +14,7 @@ def ground_station_failsafe(vehicle: Vehicle) -> dict[str, Any]:
     """Return what the vehicle does after the loss of the ground station. Requests nothing.
 
     ``action`` is a part of a sentence, such as ``lands``, or None if it is unknown. ``because`` is the parameter that
-    decides, with its value. If that value is not known yet, ``unread`` has the name of the parameter.
+    sets the action, with its value. If the value is not known yet, ``unread`` has the name of the parameter.
     """
 
     def value_of(name: str) -> float | None:

@@ -72,7 +72,7 @@ class FlightWatch:
         # The last descent at IMPACT_M_S or faster.
         self._last_sink_at = -math.inf
         self._last_sink_m_s = 0.0
-        # The last impact; None if there was none. An impact that was certainly no crash is dismissed.
+        # The last impact; None if there was none.
         self._impact_at: float | None = None
         self._impact_altitude_m: float | None = None
         self._was_sudden_stop = False
@@ -108,10 +108,10 @@ class FlightWatch:
 
     @property
     def disarming(self) -> dict[str, Any] | None:
-        """The last disarming, if it was before take-off and without an order of this server; otherwise None.
+        """The last disarming; None if the vehicle had taken off, or if this server had ordered the disarming.
 
-        ``age_s`` is the time since then. ``armed_for_s`` is the time from arming to disarming. ``parameter`` is the
-        autopilot's parameter for automatic disarming, and ``delay_s`` its value.
+        ``age_s`` is the time since the disarming. ``armed_for_s`` is the time from arming to disarming. ``parameter``
+        is the autopilot's parameter for automatic disarming, and ``delay_s`` its value.
         """
         if self._disarming is None:
             return None
@@ -161,8 +161,8 @@ class FlightWatch:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
         has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
         if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
-            # A crashed vehicle with running motors may report take-offs although it lies still. It counts as flying
-            # once it has climbed from this height. If its height is unknown, it counts as flying at once.
+            # A crashed vehicle with running motors may report a take-off although it lies still. The report is believed
+            # when the vehicle has climbed from its present altitude, or at once if this altitude is unknown.
             self._take_off_altitude_m = altitude_amsl(self._vehicle.telemetry)
             if self._take_off_altitude_m is None:
                 self._dismiss_impact()
@@ -182,8 +182,16 @@ class FlightWatch:
         # a second impact. After a crash, no further impact is detected.
         elif self._crash is None and (self._impact_at is None or self._impact_at < self._last_sink_at):
             self._start_impact(at, down_m_s)
-        if self._impact_at is not None:
-            self._evaluate_impact(at, velocity.ground_speed_m_s, vertical_speed_m_s=abs(down_m_s))
+        if self._impact_at is None or self._is_impact_dismissed:
+            return
+        ground_speed_m_s, vertical_speed_m_s = velocity.ground_speed_m_s, abs(down_m_s)
+        is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
+        if self._crash is None:
+            self._check_crashed(at, self._impact_at, is_still=is_still)
+        else:
+            self._check_flies_again(
+                at, is_still=is_still, is_fast=max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
+            )
 
     def _start_impact(self, at: float, down_m_s: float) -> None:
         self._forget_impact()
@@ -193,31 +201,30 @@ class FlightWatch:
         armed = self._vehicle.armed.latest
         self._is_impact_dismissed = not armed and at - self._disarmed_at > CRASH_ARMED_WITHIN_S
 
-    def _evaluate_impact(self, at: float, ground_speed_m_s: float, vertical_speed_m_s: float) -> None:
-        if self._is_impact_dismissed or self._impact_at is None:
-            return
-        is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
-        if self._crash is not None:
-            self._moving_since = math.inf if is_still else min(self._moving_since, at)
-            is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
-            # A slow movement must last as long as the vehicle had to lie still before it counted as crashed.
-            is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
-            if self._vehicle.armed.latest and (is_moving or self._has_climbed):
-                self._dismiss_impact()  # the vehicle flies again
-            return
+    def _check_flies_again(self, at: float, *, is_still: bool, is_fast: bool) -> None:
+        """Forget the crash if the armed vehicle moves or has climbed."""
+        self._moving_since = math.inf if is_still else min(self._moving_since, at)
+        # A slow vehicle counts as flying only after it has moved for CRASH_STILL_S. It had to lie still for the same
+        # time before it counted as crashed.
+        is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
+        if self._vehicle.armed.latest and (is_moving or self._has_climbed):
+            self._dismiss_impact()
+
+    def _check_crashed(self, at: float, impact_at: float, *, is_still: bool) -> None:
+        """Record a crash if there is evidence. Dismiss the impact if the evidence is missing for too long."""
         if is_still and self._is_at_impact_height():
             self._still_since = min(self._still_since, at)
             self._still_samples += 1
-        elif at - self._impact_at <= CRASH_STILL_WITHIN_S:  # the vehicle may still come to rest
+        elif at - impact_at <= CRASH_STILL_WITHIN_S:  # the vehicle may still come to rest
             self._still_since = math.inf
             self._still_samples = 0
         else:
             self._dismiss_impact()
             return
-        if at - self._impact_at > CRASH_EVIDENCE_WITHIN_S:
+        if at - impact_at > CRASH_EVIDENCE_WITHIN_S:
             self._dismiss_impact()
         elif self._has_crashed(at):
-            ago_s = self._now() - self._impact_at
+            ago_s = self._now() - impact_at
             self._crash = {
                 "text": self._detector.describe(),
                 "at_unix_s": round(self._vehicle.connection.unix_time() - ago_s, 1),

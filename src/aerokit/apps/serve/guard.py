@@ -176,7 +176,7 @@ RawHeaders = list[tuple[bytes, bytes]]
 
 
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
-    """Return a protocol class for the argument ``http`` of `uvicorn.Config`. It limits anonymous connections.
+    """Return a connection class for the argument ``http`` of `uvicorn.Config`. It limits anonymous connections.
 
     A connection is anonymous until one of its requests has the token. If there are too many anonymous connections, one
     of them is closed.
@@ -246,10 +246,10 @@ class _HttpConnection(H11Protocol):
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket connection with a correction, for the argument ``ws`` of `uvicorn.Config`.
+    """uvicorn's WebSocket connection without a false log message. Pass the class as ``ws`` to `uvicorn.Config`.
 
-    uvicorn 0.35 to 0.54 do not mark a handshake as complete when the app has refused it, and then log the error "ASGI
-    callable returned without completing handshake".
+    After the app has refused a handshake, uvicorn 0.35 to 0.54 log the error "ASGI callable returned without completing
+    handshake".
     """
 
     async def send(self, message: Any) -> None:

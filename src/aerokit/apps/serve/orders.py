@@ -11,7 +11,7 @@ import sys
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit._internal.formatting import to_jsonable
 from aerokit.apps.parameter_values import check_values, with_range_note
@@ -59,8 +59,15 @@ class OrderArgument:
     is_required: bool = False
 
 
-def _parse_unchanged(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    return dict(values), dict(values)
+class ParsedArguments(NamedTuple):
+    """Arguments of an order: those to store in its `OrderRecord`, and those to pass to `OrderType.run`."""
+
+    recorded: dict[str, Any]
+    passed: dict[str, Any]
+
+
+def _parse_unchanged(values: Mapping[str, Any]) -> ParsedArguments:
+    return ParsedArguments(recorded=dict(values), passed=dict(values))
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class OrderType:
 
     ``is_safe`` is True for an order that stops, lands or disarms the vehicle. It is sent even to a silent vehicle.
     ``holds_at_end`` is True if the vehicle is commanded to hold when the server ends while the order runs.
-    ``parse`` takes the arguments of the request. It returns those to record, and those to pass to ``run``.
+    ``parse`` converts the arguments of the request.
     """
 
     name: str
@@ -78,7 +85,7 @@ class OrderType:
     arguments: Mapping[str, OrderArgument] = field(default_factory=dict)
     is_safe: bool = False
     holds_at_end: bool = False
-    parse: Callable[[Mapping[str, Any]], tuple[dict[str, Any], dict[str, Any]]] = _parse_unchanged
+    parse: Callable[[Mapping[str, Any]], ParsedArguments] = _parse_unchanged
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
@@ -128,7 +135,7 @@ async def _pause(vehicle: Vehicle, _: dict[str, Any]) -> object:
 
 
 async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
-    # An ArduCopter on the ground whose mission is finished would take off and fly the mission again.
+    # On the ground, an ArduCopter with a finished mission would take off and fly the mission again.
     is_on_ground = is_reported_on_ground(vehicle, max_age_s=_LANDED_STATE_MAX_AGE_S)
     if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in SURFACE_TYPES:
         raise OperationRejected(
@@ -177,8 +184,8 @@ def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
     return name, text, parse_plan_text(text, name)
 
 
-def _parse_plan_arguments(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arguments to record (name, counts and hash of the plan), and the keyword arguments of the order."""
+def _parse_plan_arguments(values: Mapping[str, Any]) -> ParsedArguments:
+    """Parse the plan. Record only its name, counts and hash, because a plan may be large."""
     name, text, plan = parse_plan_body(values)
     counts = {
         "mission_items": len(plan.mission),
@@ -187,7 +194,8 @@ def _parse_plan_arguments(values: Mapping[str, Any]) -> tuple[dict[str, Any], di
     }
     if not any(counts.values()):
         raise InvalidArgument(f"{name} has no mission items, fence or rally points; nothing was sent")
-    return {"name": name, **counts, "sha256": hashlib.sha256(text.encode()).hexdigest()}, {"plan": plan}
+    recorded = {"name": name, **counts, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    return ParsedArguments(recorded, passed={"plan": plan})
 
 
 _POSITION = {
@@ -339,11 +347,11 @@ class OrderRunner:
                 "KeyMissing",
                 "an order needs a unique Idempotency-Key header: 8 to 64 characters of A-Z a-z 0-9 . _ ~ -",
             )
-        recorded_arguments, arguments = order_type.parse(arguments)
+        parsed = order_type.parse(arguments)
         earlier = self._records.get(key)
-        if earlier is not None and earlier.is_same(vehicle.system_id, order_type.name, recorded_arguments):
-            return earlier
         if earlier is not None:
+            if earlier.is_same(vehicle.system_id, order_type.name, parsed.recorded):
+                return earlier
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
         # The client may be retrying this same order. With a new key, it would be executed again.
         if key in self._used_keys:
@@ -353,10 +361,10 @@ class OrderRunner:
                 "an order with this Idempotency-Key has ended, and its result is no longer stored; nothing was sent"
                 " now: check the state of the vehicle before you give an order with a new key",
             )
-        self._check(vehicle, order_type, recorded_arguments, seen_at_s)
+        self._check(vehicle, order_type, parsed.recorded, seen_at_s)
         unix_s = vehicle.connection.unix_time()
-        record = OrderRecord(key, vehicle.system_id, order_type.name, recorded_arguments, unix_s)
-        run = partial(self._run, vehicle, order_type, record, arguments)
+        record = OrderRecord(key, vehicle.system_id, order_type.name, parsed.recorded, unix_s)
+        run = partial(self._run, vehicle, order_type, record, parsed.passed)
         task = self._background.start(run, f"aerokit serve {order_type.name}")
         if task is None:
             raise HttpProblem(503, "Ended", "the server has ended; nothing was sent")
@@ -408,8 +416,10 @@ class OrderRunner:
                 f"{order_type.name}: vehicle {vehicle.system_id} is silent"
                 f" (last heartbeat {vehicle.heartbeat_age:.1f} s ago); nothing was sent"
             )
-        records = [record for record in self._records.values() if record.system_id == vehicle.system_id]
-        if len([record for record in records if record.state == "running"]) >= MAX_RUNNING:
+        running_count = sum(
+            record.system_id == vehicle.system_id and record.state == "running" for record in self._records.values()
+        )
+        if running_count >= MAX_RUNNING:
             raise BusyError(
                 f"{MAX_RUNNING} orders to vehicle {vehicle.system_id} are already running; nothing was sent"
             )

@@ -223,7 +223,7 @@ class ServedVehicles:
             **overview(vehicle),
             "missing_for_flight": missing,
             "not_armable": not_armable(vehicle, missing),
-            # `self.crash` allows orders, so it is None for a silent vehicle. The page shows the last known crash.
+            # `self.crash` is None for a silent vehicle, because it may have moved. The page shows its last known crash.
             "crash": self.crash(vehicle) if is_connected else watch.crash,
             "disarming": watch.disarming,
             "disarm_parameter": watch.disarm_parameter,

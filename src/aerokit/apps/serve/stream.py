@@ -66,7 +66,7 @@ class StateStream:
             self._anonymous.discard(socket)
 
     def _admit(self, socket: WebSocket) -> float:
-        """Return the rate of state messages that a client requests; raise HttpProblem if it is not admitted."""
+        """Return the client's ``rate_hz`` for state messages. Raise HttpProblem if the client is not admitted."""
         self._access.check(socket.headers)
         if len(self._open) >= MAX_SOCKETS:
             raise HttpProblem(503, "TooManySockets", f"the maximum number of clients ({MAX_SOCKETS}) is connected")
