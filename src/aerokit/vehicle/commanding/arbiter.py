@@ -58,6 +58,8 @@ class CommandArbiter:
         self.arm_commands_sent: int = 0
         """Number of arm and disarm commands sent."""
         self.disarm_commands_sent: int = 0
+        self.last_arm_command: bool | None = None
+        """True if the newest of these commands arms, False if it disarms; None before the first one."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         # Until this time, any reported mode may be the effect of a raw command.
@@ -305,6 +307,7 @@ class CommandArbiter:
             return
         self.arm_commands_sent += 1
         self.disarm_commands_sent += not armed
+        self.last_arm_command = armed
         self.supersede(("arm",))
         for sent in self._sent:
             sent.on_newer_command(armed)
