@@ -153,7 +153,11 @@ class CommandArbiter:
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        self._orders = [order]  # All other actions have ended, so HEARTBEATs no longer update them.
+        # HEARTBEATs no longer update orders that have ended.
+        self._orders = [active for active in self._orders if active.is_newest]
+        for active in self._orders:  # A change to a mode of the new order is not a takeover.
+            active.expect(modes, any_until=order.any_mode_until)
+        self._orders.append(order)
         return order
 
     def raw_order(self, subjects: Collection[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
