@@ -26,6 +26,7 @@ from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.order import SUPERSEDED
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
+from aerokit.vehicle.commanding.sender import add_clause
 from aerokit.vehicle.state.status_text import CHUNK_LENGTH
 
 if TYPE_CHECKING:
@@ -222,7 +223,7 @@ class ArmingActions(VehicleBase):
             except (anyio.get_cancelled_exc_class(), AerokitError) as error:
                 is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
                 if is_watched and isinstance(error, CommandTimeout):
-                    error.args = (f"{error}; {self._arm_cleanup.hint()}",)
+                    add_clause(error, self._arm_cleanup.hint())
                 raise
 
     async def disarm(
@@ -379,7 +380,7 @@ class ArmingActions(VehicleBase):
                 return
         # The vehicle has not rebooted in time.
         if unanswered is not None:
-            unanswered.args = (f"{unanswered}; the command is sent only once, and may still be executed",)
+            add_clause(unanswered, "the command is sent only once, and may still be executed")
             raise unanswered
         raise OperationTimeout(
             f"reboot: the vehicle did not restart within {timeout:g} s; {self._session.describe_link()}"

@@ -10,6 +10,7 @@ import anyio
 
 from aerokit._internal.arguments import check_range
 from aerokit.errors import (
+    AerokitError,
     CommandRejected,
     CommandTimeout,
     HeartbeatTimeout,
@@ -39,6 +40,12 @@ FORCE = 21196
 # HEARTBEAT reports the effect of a command to disarm within this many seconds, even if one of them is lost.
 DISARM_REPORT_TIMEOUT_S = 3.5
 ACCEPTANCE_REVOKED = "the vehicle accepted the command and then refused it"
+
+
+def add_clause(error: AerokitError, clause: str) -> None:
+    """Append a clause to the error's text, in front of the vehicle's reasons."""
+    text, newline, reasons = str(error).partition("\n")
+    error.args = (f"{text}; {clause}{newline}{reasons}",)
 
 
 class OrderSender:
