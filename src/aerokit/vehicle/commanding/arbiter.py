@@ -228,8 +228,9 @@ class CommandArbiter:
         disarms = armed is False
         if is_steering:
             self._notify_steering()
-            for previous in (self.newest, self._arming_order):
-                if previous is not None:  # A change to a mode of the posted order is not a takeover.
+            arming_order = () if self._arming_order is None else (self._arming_order,)
+            for previous in (*arming_order, *self._orders):
+                if ACTION not in previous.ending_topics:  # A change to a mode of the posted order is not a takeover.
                     previous.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
