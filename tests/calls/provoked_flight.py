@@ -115,6 +115,10 @@ def _clear_state(name: str) -> Callable[[Stage], None]:
     return clear
 
 
+def _order_to_arm(stage: Stage) -> None:
+    stage.vehicle.send(messages.CommandLong(1, 1, Cmd.COMPONENT_ARM_DISARM, 0, 1, *[0.0] * 6))
+
+
 def _actions() -> Table:
     reboot, arm, mode = Cmd.PREFLIGHT_REBOOT_SHUTDOWN, Cmd.COMPONENT_ARM_DISARM, Cmd.DO_SET_MODE
     command = _method("command", Cmd.DO_SET_HOME, 1)
@@ -133,6 +137,9 @@ def _actions() -> Table:
         ),
         ("Vehicle.disarm", "HeartbeatTimeout"): later(
             _method("disarm", timeout=30), stops_sending, 1.0, armed, before=accepted(arm)
+        ),
+        ("Vehicle.disarm", "OperationRejected"): later(
+            _method("disarm"), _order_to_arm, 0.3, armed, before=accepted(arm)
         ),
         ("Vehicle.disarm", "CommandRejected"): P(_method("disarm"), airborne),
         ("Vehicle.disarm", "OperationTimeout"): P(_method("disarm", timeout=1.5), armed, accepted(arm)),

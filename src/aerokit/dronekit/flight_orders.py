@@ -29,6 +29,7 @@ from aerokit.mavlink.messages import PlayTune
 from aerokit.parameters import ParameterType
 from aerokit.protocols.command import command_long
 from aerokit.vehicle.commanding.arbiter import MODE_MAX_AGE_S
+from aerokit.vehicle.commanding.sender import add_clause
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot, Purpose
@@ -117,7 +118,7 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
         raise
     except (OperationRejected, OperationTimeout) as error:
         if getattr(error, "was_sent", True):
-            error.args = (f"{error}; the vehicle may still execute the command, which is not monitored any more",)
+            add_clause(error, "the vehicle may still execute the command, which is not monitored any more")
         raise
 
 

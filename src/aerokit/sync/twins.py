@@ -4556,8 +4556,8 @@ class Vehicle(VehicleTwin):
                 estimates. A vehicle that can run its checks on request runs them again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm. The error text says whether it
                 may still arm.
-            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
-                party disarmed it or changed its mode meanwhile.
+            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent). Or, before
+                it reported armed, another party changed its mode or disarmed it, or your program ordered to disarm.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
@@ -4587,6 +4587,7 @@ class Vehicle(VehicleTwin):
         Raises:
             CommandRejected: the vehicle refused, usually because it is flying.
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: your program ordered to arm before the vehicle reported disarmed.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not disarm.
         """

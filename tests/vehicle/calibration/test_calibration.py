@@ -25,7 +25,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavSeverity
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.calibration.calibration import Calibration
@@ -255,15 +255,36 @@ async def test_lost_cancel_is_repeated(kind: type[Any]) -> None:
         assert len([params for params in orders(wire, CANCELS[kind][0]) if not any(params)]) >= 3
 
 
-async def test_lost_cancel_is_repeated_despite_newer_action() -> None:
+@pytest.mark.parametrize("is_action_first", [False, True])
+async def test_lost_cancel_is_not_repeated_after_takeover(is_action_first: bool) -> None:
+    async with stage(SimulatedCopter) as (copter, vehicle, wire):
+        calibration = vehicle.calibrate.compass()
+        await calibration.__anext__()
+        copter.faults.ignore(MavCmd.DO_CANCEL_MAG_CAL)
+        cancelling = asyncio.create_task(calibration.cancel())
+        await anyio.sleep(0.1)
+        if is_action_first:
+            await vehicle.set_mode("LOITER")
+        copter.set_mode(CopterMode.ALT_HOLD)  # by the pilot
+        with pytest.raises(OperationTimeout):
+            await cancelling
+        assert len(orders(wire, MavCmd.DO_CANCEL_MAG_CAL)) == 1
+
+
+@pytest.mark.parametrize("is_raw", [False, True])
+async def test_lost_cancel_is_repeated_after_own_mode_change(is_raw: bool) -> None:
     async with stage(SimulatedCopter) as (copter, vehicle, _):
         calibration = vehicle.calibrate.compass()
         await calibration.__anext__()
         copter.faults.ignore(MavCmd.DO_CANCEL_MAG_CAL, times=1)
         cancelling = asyncio.create_task(calibration.cancel())
-        await anyio.sleep(0.5)
-        await vehicle.set_mode("LOITER")
+        await anyio.sleep(0.1)
+        if is_raw:
+            await vehicle.command(MavCmd.DO_SET_MODE, 1, CopterMode.LOITER)
+        else:
+            await vehicle.set_mode("LOITER")
         await cancelling
+        assert vehicle.mode_name == "LOITER"
         assert not is_running(copter)
 
 

@@ -355,3 +355,47 @@ async def test_disarm_is_repeated_after_answer_to_earlier_arm(grounded: Flight, 
         await anyio.sleep(4.0)
     assert ordered(grounded) == [1, 0, 0]
     assert not copter.is_armed
+
+
+async def after_heartbeat(flight: Flight) -> None:
+    """Wait for the next HEARTBEAT."""
+    armed = flight.vehicle.armed
+    reported_at = armed.updated_at
+    await armed.wait_until(lambda _: armed.updated_at > reported_at)
+
+
+@pytest.mark.parametrize("first", ["arm", "disarm"])
+async def test_acknowledged_arm_command_ends_with_opposite_one(grounded: Flight, first: str) -> None:
+    """No HEARTBEAT is received between the two orders of the program."""
+    vehicle = grounded.vehicle
+    await vehicle.set_mode("GUIDED")
+    if first == "disarm":
+        await vehicle.arm()
+    await after_heartbeat(grounded)
+    orders = [vehicle.arm, vehicle.disarm] if first == "arm" else [vehicle.disarm, vehicle.arm]
+    async with anyio.create_task_group() as tasks:
+        older = asyncio.create_task(orders[0]())
+        await anyio.sleep(0.2)
+        assert grounded.copter.is_armed is (first == "arm")
+        tasks.start_soon(orders[1])
+    with pytest.raises(OperationRejected, match="another order was given"):
+        await older
+    await anyio.sleep(5.0)
+    assert ordered(grounded)[-2:] == ([1, 0] if first == "arm" else [0, 1])
+    assert grounded.copter.is_armed is (first == "disarm")
+
+
+@pytest.mark.parametrize("timeout", [0.5, 10.0])
+async def test_acknowledged_disarm_keeps_later_arming_of_pilot(grounded: Flight, timeout: float) -> None:
+    """The pilot arms again before a HEARTBEAT reports disarmed. The program armed long before."""
+    vehicle, copter = grounded.vehicle, grounded.copter
+    copter.parameters["DISARM_DELAY"] = 0.0
+    await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    await anyio.sleep(10.0)
+    await after_heartbeat(grounded)
+    asyncio.get_running_loop().call_later(0.3, copter.arming.arm)
+    with pytest.raises(OperationTimeout):
+        await vehicle.disarm(timeout=timeout)
+    assert ordered(grounded) == [1, 0]
+    assert copter.is_armed

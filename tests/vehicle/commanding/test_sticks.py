@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import anyio
 import pytest
 from flight_harness import Flight, block_loop, in_the_air, open_flight, open_px4
@@ -9,7 +11,7 @@ from flight_harness import Flight, block_loop, in_the_air, open_flight, open_px4
 from aerokit import StickInput
 from aerokit import messages as m
 from aerokit.errors import BusyError, InvalidArgument, NotSupported, OperationRejected, SetpointStreamStopped
-from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.sim import SimulatedRover, SimulatedSub
 from aerokit.sim.px4.modes import POSITION
 
@@ -147,6 +149,26 @@ async def test_pilot_while_parameters_are_read_keeps_vehicle() -> None:
                 raise AssertionError("entered")
         assert not flight.wire.mode_orders()
         assert not flight.wire.all(m.ManualControl)
+
+
+async def test_sticks_after_earlier_takeover_keep_pilot_who_orders_hold_mode() -> None:
+    """The hold of the first stream was lost. The pilot chooses its mode while the second stream reads parameters."""
+    async with in_the_air(latency_s=0.3) as flight:
+        with anyio.move_on_after(4.0):
+            async with flight.vehicle.sticks() as sticks:
+                await sticks.move(FORWARD, 60.0)
+        flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
+        flight.copter.set_mode(CopterMode.ALT_HOLD)
+        await anyio.sleep(10.0)
+        flight.copter.faults.commands.clear()
+        reported_at = flight.vehicle.armed.updated_at
+        await flight.vehicle.armed.wait_until(lambda _: flight.vehicle.armed.updated_at > reported_at)
+        await anyio.sleep(0.6)  # of the second from one HEARTBEAT to the next
+        asyncio.get_running_loop().call_later(0.05, flight.copter.set_mode, CopterMode.BRAKE)
+        with pytest.raises(OperationRejected, match="the mode changed from ALT_HOLD to BRAKE"):
+            async with flight.vehicle.sticks():
+                pass
+        assert flight.vehicle.mode_name == "BRAKE"
 
 
 async def test_sticks_again_after_cancellation_accept_own_late_hold() -> None:

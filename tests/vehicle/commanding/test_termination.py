@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import anyio
 import pytest
 from flight_harness import Wire, in_the_air, open_flight
 
 import aerokit
+from aerokit import messages as m
 from aerokit.connection.cells import Source
 from aerokit.errors import CommandTimeout, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavCmd, MavResult, MavState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavSeverity, MavState
 from aerokit.sim import SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -63,6 +66,20 @@ async def test_terminate_unanswered_and_replaced_may_have_been_executed() -> Non
 
         tasks.start_soon(hold)
         text = "no COMMAND_ACK .*another order was given.*may have been terminated nevertheless"
+        with pytest.raises(OperationRejected, match=text):
+            await flight.vehicle.terminate(intent="terminate flight")
+
+
+async def test_terminate_unanswered_after_takeover_may_have_been_executed() -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.ignore(TERMINATE)
+
+        def take_over() -> None:
+            flight.copter.set_mode(CopterMode.LOITER)
+            flight.copter.send(m.Statustext(MavSeverity.WARNING, "pilot", 0, 0))
+
+        asyncio.get_running_loop().call_later(0.5, take_over)
+        text = r"no COMMAND_ACK .*may have been terminated nevertheless\n(  - .*\n)*  - pilot$"
         with pytest.raises(OperationRejected, match=text):
             await flight.vehicle.terminate(intent="terminate flight")
 

@@ -33,14 +33,20 @@ async def test_winch_stop_before_pay_out_was_sent_stands() -> None:
         assert [each[1] for each in params(flight, C.DO_WINCH)] == [2]
 
 
-async def test_unrepeated_order_awaits_late_acknowledgement_despite_flight_order() -> None:
+@pytest.mark.parametrize("is_posted", [False, True])
+async def test_unrepeated_order_awaits_late_acknowledgement_despite_flight_order(is_posted: bool) -> None:
     async with open_flight(fitted_copter()) as flight, anyio.create_task_group() as tasks:
         await flight.vehicle.wait_ready()
         flight.copter.faults.delay_ack(C.DO_GRIPPER, 2.0)
 
         async def steer() -> None:
             await anyio.sleep(0.3)
-            await flight.vehicle.set_mode("LOITER")
+            if is_posted:
+                loiter = flight.vehicle.autopilot.find_mode("LOITER")
+                with flight.vehicle.posted("mode", "motion", modes=(loiter,)) as order:
+                    await order.set_mode(loiter)
+            else:
+                await flight.vehicle.set_mode("LOITER")
 
         tasks.start_soon(steer)
         await flight.vehicle.gripper().release()

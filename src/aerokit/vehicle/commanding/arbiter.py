@@ -59,6 +59,8 @@ class CommandArbiter:
         self.arm_commands_sent: int = 0
         """Number of arm and disarm commands sent."""
         self.disarm_commands_sent: int = 0
+        self.last_arm_command: bool | None = None
+        """True if the newest of these commands arms, False if it disarms; None before the first one."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         # Until this time, any reported mode may be the effect of a raw command.
@@ -151,7 +153,11 @@ class CommandArbiter:
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        self._orders = [order]  # All other actions have ended, so HEARTBEATs no longer update them.
+        # HEARTBEATs no longer update orders that have ended.
+        self._orders = [active for active in self._orders if active.is_newest]
+        for active in self._orders:  # A change to a mode of the new order is not a takeover.
+            active.expect(modes, any_until=order.any_mode_until)
+        self._orders.append(order)
         return order
 
     def raw_order(self, subjects: Collection[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
@@ -221,8 +227,9 @@ class CommandArbiter:
         disarms = armed is False
         if is_steering:
             self._notify_steering()
-            for previous in (self.newest, self._arming_order):
-                if previous is not None:  # For it, a change to a mode of the posted order is not a takeover.
+            arming_order = () if self._arming_order is None else (self._arming_order,)
+            for previous in (*arming_order, *self._orders):
+                if ACTION not in previous.ending_topics:  # A change to a mode of the posted order is not a takeover.
                     previous.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
@@ -304,6 +311,7 @@ class CommandArbiter:
             return
         self.arm_commands_sent += 1
         self.disarm_commands_sent += not armed
+        self.last_arm_command = armed
         self.supersede(("arm",))
         for sent in self._sent:
             sent.on_newer_command(armed)

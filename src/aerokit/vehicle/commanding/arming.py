@@ -24,8 +24,9 @@ from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.commanding.arbiter import STEERING
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
+from aerokit.vehicle.commanding.order import SUPERSEDED
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
-from aerokit.vehicle.commanding.sender import DISARM_REPORT_TIMEOUT_S
+from aerokit.vehicle.commanding.sender import add_clause
 from aerokit.vehicle.state.status_text import CHUNK_LENGTH
 
 if TYPE_CHECKING:
@@ -156,8 +157,8 @@ class ArmingActions(VehicleBase):
                 estimates. A vehicle that can run its checks on request runs them again for this.
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm. The error text says whether it
                 may still arm.
-            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent), or another
-                party disarmed it or changed its mode meanwhile.
+            OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent). Or, before
+                it reported armed, another party changed its mode or disarmed it, or your program ordered to disarm.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
@@ -222,7 +223,7 @@ class ArmingActions(VehicleBase):
             except (anyio.get_cancelled_exc_class(), AerokitError) as error:
                 is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
                 if is_watched and isinstance(error, CommandTimeout):
-                    error.args = (f"{error}; {self._arm_cleanup.hint()}",)
+                    add_clause(error, self._arm_cleanup.hint())
                 raise
 
     async def disarm(
@@ -242,19 +243,19 @@ class ArmingActions(VehicleBase):
         Raises:
             CommandRejected: the vehicle refused, usually because it is flying.
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: your program ordered to arm before the vehicle reported disarmed.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not disarm.
         """
         self._arm_cleanup.stop()
         started = self.connection.now()
-        report_timeout_s = min(timeout, DISARM_REPORT_TIMEOUT_S)
         with self._arbiter.auxiliary_order(ends_flight=True) as order:
             try:
-                await self._sender.send_disarm(order, force=force, report_timeout_s=report_timeout_s)
+                accepted_at = await self._sender.send_disarm(order, force=force, timeout=timeout)
             except CommandRejected as error:
                 # ArduCopter sends no status text when it refuses to disarm in the air (AP_Arming_Copter.cpp, disarm).
                 raise self._session.with_reasons(error, started, self._reason_if_flying()) from None
-            remaining_s = timeout - report_timeout_s
+            remaining_s = max(0.0, accepted_at + timeout - self.connection.now())
             await self._await_armed(
                 armed=False, order=order, started=started, timeout=remaining_s, max_silence_s=max_silence_s
             )
@@ -269,12 +270,18 @@ class ArmingActions(VehicleBase):
         self, *, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
     ) -> None:
         cell = self.telemetry.armed
+
+        def failure_reason() -> str:
+            if self._arbiter.last_arm_command is not armed:
+                return SUPERSEDED
+            # A mode change or a failsafe does not keep the vehicle from disarming.
+            return order.takeover_reason if armed else ""
+
         await await_progress(
             self._session,
             "arm()" if armed else "disarm()",
             is_done=lambda: cell.latest is armed and cell.updated_at > started and self._arbiter.is_state_recent,
-            # A mode change or a failsafe does not keep the vehicle from disarming.
-            failure_reason=lambda: order.takeover_reason if armed else None,
+            failure_reason=failure_reason,
             describe=lambda: "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text",
             timeout=timeout,
             max_silence_s=max_silence_s,
@@ -373,7 +380,7 @@ class ArmingActions(VehicleBase):
                 return
         # The vehicle has not rebooted in time.
         if unanswered is not None:
-            unanswered.args = (f"{unanswered}; the command is sent only once, and may still be executed",)
+            add_clause(unanswered, "the command is sent only once, and may still be executed")
             raise unanswered
         raise OperationTimeout(
             f"reboot: the vehicle did not restart within {timeout:g} s; {self._session.describe_link()}"

@@ -208,7 +208,8 @@ class Order:
         self._is_newest = is_newest
         self.settles_at: float = settles_at
         """Until this time, the modes of earlier orders may be reported in any sequence."""
-        self._any_mode_until = any_until
+        self.any_mode_until: float = any_until
+        """Until this time, every mode may be the effect of a raw command."""
         self._requires_mode_change = requires_mode_change
 
     @property
@@ -232,9 +233,10 @@ class Order:
     def is_own(self, mode: Mode) -> bool:
         return mode.custom_mode in self._own_modes
 
-    def expect(self, modes: Collection[Mode]) -> None:
-        """Also accept these modes as effects of the order."""
+    def expect(self, modes: Collection[Mode], *, any_until: float = -math.inf) -> None:
+        """Also accept these modes as effects of the order, and every mode until ``any_until``."""
         self._own_modes |= {mode.custom_mode for mode in modes}
+        self.any_mode_until = max(self.any_mode_until, any_until)
 
     def withdraw(self) -> None:
         """Take this order back, for example after a refusal. The device's previous order becomes valid again."""
@@ -266,7 +268,7 @@ class Order:
         elif is_expected and is_settled:
             # An earlier order of the program has changed the mode. After this, only another party can change it back.
             self._accepted_modes -= self._modes_before
-        elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
+        elif is_first_report or reported_at < self.any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:
                 self.unexplained = f"the mode changed to {mode}"
             self._accepted_modes.add(number)

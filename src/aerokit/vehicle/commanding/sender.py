@@ -10,6 +10,7 @@ import anyio
 
 from aerokit._internal.arguments import check_range
 from aerokit.errors import (
+    AerokitError,
     CommandRejected,
     CommandTimeout,
     HeartbeatTimeout,
@@ -19,10 +20,11 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, allowed_attempts, rejection
-from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
+from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
 from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, MOTION, REQUEST_COMMANDS, SUPERSEDED
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
+from aerokit.vehicle.session.commands import PENDING_ACK_TIMEOUT_S
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterator
@@ -35,9 +37,15 @@ if TYPE_CHECKING:
 
 FORCE = 21196
 """param2 of COMPONENT_ARM_DISARM that skips the pre-arm checks."""
-DISARM_REPORT_TIMEOUT_S = 2.5
-"""HEARTBEAT reports disarmed within this many seconds after a command to disarm, even if two of them are lost."""
+# HEARTBEAT reports the effect of a command to disarm within this many seconds, even if one of them is lost.
+DISARM_REPORT_TIMEOUT_S = 3.5
 ACCEPTANCE_REVOKED = "the vehicle accepted the command and then refused it"
+
+
+def add_clause(error: AerokitError, clause: str) -> None:
+    """Append a clause to the error's text, in front of the vehicle's reasons."""
+    text, newline, reasons = str(error).partition("\n")
+    error.args = (f"{text}; {clause}{newline}{reasons}",)
 
 
 class OrderSender:
@@ -153,23 +161,33 @@ class OrderSender:
         params = (float(armed), FORCE if force else 0)
         await self.send_long(order, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
 
-    async def send_disarm(
-        self, order: Order, *, force: bool = False, report_timeout_s: float = DISARM_REPORT_TIMEOUT_S
-    ) -> None:
-        """Send the command to disarm, and once more if HEARTBEAT still reports armed after ``report_timeout_s``.
+    async def send_disarm(self, order: Order, *, force: bool = False, timeout: float = math.inf) -> float:
+        """Send the command to disarm, and return the time of its acknowledgement.
 
-        The COMMAND_ACK alone is no proof. On a link that duplicates frames, the second COMMAND_ACK of an earlier
-        command to arm looks like the one of this command.
+        On a link that duplicates frames, a second COMMAND_ACK of an earlier command to arm looks like the one of this
+        command. If this is possible, wait for HEARTBEAT, at most ``timeout`` seconds. If it still reports armed, send
+        the command once more.
         """
-        armed, started = self._session.telemetry.armed, self._session.connection.now()
+        armed, now = self._session.telemetry.armed, self._session.connection.now
+        started = now()
+        arm_answered_at = self._session.commands.accepted_at(MavCmd.COMPONENT_ARM_DISARM)
         await self.send_arm(order, armed=False, force=force)
+        accepted_at = now()
+        if started - arm_answered_at > PENDING_ACK_TIMEOUT_S:
+            return accepted_at
+        effect_due_at = accepted_at + ARM_HEARTBEAT_DELAY_S
+        is_still_armed = False
         with suppress(OperationTimeout):
-            await armed.wait_until(
-                lambda is_armed: not is_armed and armed.updated_at > started, timeout=report_timeout_s
+            is_still_armed = await armed.wait_until(
+                lambda is_armed: armed.updated_at > (effect_due_at if is_armed else started),
+                timeout=min(timeout, DISARM_REPORT_TIMEOUT_S),
             )
-            return
-        if not order.end and self._arbiter.is_state_recent:
+        is_current = self._arbiter.is_state_recent and not self._arbiter.slept_since(started)
+        is_newest = self._arbiter.last_arm_command is False
+        if is_still_armed and is_current and is_newest and not order.end:
             await self.send_arm(order, armed=False, force=force)
+            return now()
+        return accepted_at
 
     # ----------------------------------------------------------------------------------- modes
 

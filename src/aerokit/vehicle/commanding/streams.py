@@ -359,7 +359,8 @@ class TakeoverCheck:
         self._mode_before = telemetry.mode.latest
         self._order_before = context.arbiter.latest(STEERING)
         # True if the vehicle may still change to a mode of this order, e.g. of the hold after an abandoned flight.
-        self._may_change_late = context.arbiter.mode_is_in_doubt
+        is_taken_over = self._order_before is not None and bool(self._order_before.takeover_reason)
+        self._may_change_late = context.arbiter.mode_is_in_doubt and not is_taken_over
         take_off_mode = autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol)
         hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
         self._end_of_take_off = (take_off_mode, hold_mode)

@@ -10,6 +10,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, LinkLost, NotSupport
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
+from aerokit.vehicle.commanding.sender import add_clause
 
 TerminationIntent = Literal["terminate flight"]
 ShutdownIntent = Literal["shut down"]
@@ -57,7 +58,7 @@ class TerminationActions(VehicleBase):
             raise
         except (CommandTimeout, OperationRejected) as error:
             if order.was_sent:
-                error.args = (f"{error}; the flight may have been terminated nevertheless",)
+                add_clause(error, "the flight may have been terminated nevertheless")
             raise
         armed, state = self.telemetry.armed, self.telemetry.system_status
 
@@ -106,7 +107,7 @@ class TerminationActions(VehicleBase):
                 raise
             except (CommandTimeout, OperationRejected) as error:
                 if order.was_sent:
-                    error.args = (f"{error}; the autopilot may have switched off nevertheless",)
+                    add_clause(error, "the autopilot may have switched off nevertheless")
                 raise
         with suppress(LinkLost):  # The link may go down with the autopilot.
             await await_progress(
