@@ -274,7 +274,8 @@ async def test_position_of_command_int_is_in_degrees() -> None:
         def look(request: CommandRequest) -> None:
             found.append(request)
 
-        head = (*station.target, MavFrame.GLOBAL_RELATIVE_ALT, MavCmd.DO_SET_ROI_LOCATION, 0, 0)
+        system, component = station.target
+        head = (system, component, MavFrame.GLOBAL_RELATIVE_ALT, MavCmd.DO_SET_ROI_LOCATION, 0, 0)
         command = m.CommandInt(*head, 0.0, 0.0, 0.0, 0.0, 473977420, 85455940, 30.0)
         await station.ask(command, m.CommandAck)
     position = found[0].position

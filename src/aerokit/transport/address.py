@@ -386,4 +386,4 @@ _KINDS: dict[LinkKind, _Kind] = {
     "zenoh": _Kind(("zenoh",), _Parser.parse_zenoh, (*_NETWORK, "client", "control", "timeout", "costly")),
     "zenohin": _Kind(("zenohin",), _Parser.parse_zenoh, (*_NETWORK, "costly")),
 }
-_SCHEMES = {scheme: kind for kind, row in _KINDS.items() for scheme in row.schemes}
+_SCHEMES: dict[str, LinkKind] = {scheme: kind for kind, row in _KINDS.items() for scheme in row.schemes}

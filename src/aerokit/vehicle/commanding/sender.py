@@ -87,6 +87,7 @@ class OrderSender:
             late_modes = self._arbiter.late_modes()
             modes = () if self._is_taking_off else tuple(mode for mode in modes if mode not in late_modes)
         started, was_sent_before = self._session.connection.now(), order.was_sent
+        sent: SentCommand | None = None
         try:
             with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sent:
                 try:
@@ -145,11 +146,12 @@ class OrderSender:
         if not order.only_stops and self._arbiter.slept_since(order.given_at) > 0:
             raise OperationRejected("the computer slept; the rest of the order was not sent")
 
-    def _unanswered(self, error: CommandTimeout, order: Order, sent: SentCommand) -> Exception:
+    def _unanswered(self, error: CommandTimeout, order: Order, sent: SentCommand | None) -> Exception:
         """Return the error to raise for a command without an answer."""
         if order.takeover_reason or (order.failsafe and order.end):  # Another party has ended the order.
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
-        is_overruled = sent.end == SUPERSEDED and order.is_newest  # arm by disarm, or the reverse
+        # A command to arm is overruled by one to disarm, and the reverse.
+        is_overruled = sent is not None and sent.end == SUPERSEDED and order.is_newest
         if is_overruled or self._arbiter.is_replaced(order):
             # A command in progress is awaited for a while after the newer order, so its error may not name that order.
             return OperationRejected(str(error) if SUPERSEDED in str(error) else f"{error}; {SUPERSEDED}")
