@@ -33,13 +33,13 @@ class ReceivedFrame:
     __slots__ = ("_links", "_owner_links", "at", "count", "is_admitted", "is_delivered")
 
     def __init__(self, at: float, count: int, link: int, *, is_other_peer: bool) -> None:
-        self.at = at
+        self.at: float = at
         """Receive time of the first copy."""
-        self.count = count
+        self.count: int = count
         """Number of frames received from the sender until then, this one included."""
-        self.is_admitted = False
+        self.is_admitted: bool = False
         """True if a copy has passed the signature check."""
-        self.is_delivered = False
+        self.is_delivered: bool = False
         # One bit for each link over which a copy arrived. `_owner_links` omits copies from a second sender with the
         # same ids.
         self._links = 1 << link

@@ -68,7 +68,8 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self._reset()
 
     def _reset(self) -> None:
-        self.primary = self.secondary = ComponentIds()
+        self.primary: ComponentIds = ComponentIds()
+        self.secondary: ComponentIds = ComponentIds()
         self.flags: int = 0
         self.region: GlobalPoint | None = None
         """Position to point at; None without a region of interest."""
