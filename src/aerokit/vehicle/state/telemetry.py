@@ -238,7 +238,7 @@ class Telemetry(States):
             value = decode(message)
             if value is None:  # The message does not have the value, so the cell keeps its previous value.
                 return
-            if may_be_older and _is_from_other_message(cell, source) and self._time_of_arrival() < cell._updated_at:
+            if may_be_older and self._time_of_arrival() < cell.updated_at and _is_from_other_message(cell, source):
                 return
             cell.set(value, source)
 
