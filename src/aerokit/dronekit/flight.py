@@ -262,7 +262,7 @@ class FlightMethods(VehicleAttributes):
         A reboot of the vehicle resets it to None.
 
         Set it to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME). As in DroneKit, the attribute changes at once; a
-        refusal restores it. Raises ValueError, without sending, for another type or for a missing or wrong number.
+        refusal restores it. Raises ValueError, without sending, for another type or an invalid coordinate.
         """
         home = self._home_location
         return None if home is None else LocationGlobal(home.lat, home.lon, home.alt)

@@ -64,7 +64,7 @@ class SimParameters:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
         # Maps the name of a parameter to the name of the parameter that enables it.
         self._switches = {row.name: row.switch for row in self._all_rows() if row.switch is not None}
-        self._unlisted: frozenset[str] = frozenset()  # names beyond the number of parameters to list
+        self._unlisted: frozenset[str] = frozenset()  # names that the list leaves out
         self._names: tuple[str, ...] | None = None  # None if they must be computed at the next access
         self._indices: dict[str, int] = {}
 
@@ -231,7 +231,7 @@ class ParameterPackMount(Mount):
 
 
 class _Reader(FileHandle):
-    """Download of parameters. All reads must have the same size, which is the block size of the padding."""
+    """Download of parameters. All reads must have the same size, because the file is padded to blocks of this size."""
 
     def __init__(self, parameters: SimParameters, path: str, block: int | None) -> None:
         query = _query(path)

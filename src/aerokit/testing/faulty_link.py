@@ -90,7 +90,7 @@ class StalledQueue:
             outbox.resume()
 
     def close(self) -> None:
-        """Close the queues. Bytes that the operating system has accepted are not sent."""
+        """Close the queues, and drop what they contain."""
         for outbox in self._outboxes.values():
             outbox.discard()
             outbox.close()

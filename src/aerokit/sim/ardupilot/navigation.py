@@ -272,7 +272,7 @@ class SmartPath:
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
         self._good_at = -math.inf  # time of the last good position
-        self._saved_at = -math.inf  # time at which the path last had space
+        self._saved_at = -math.inf  # time at which the path was last not full
         self._warned_at = -math.inf
         self._is_started = False  # True after the first `reset`
         self.is_active: bool = False  # True while SMART_RTL is possible.

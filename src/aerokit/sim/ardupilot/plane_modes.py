@@ -13,7 +13,7 @@ from aerokit.sim.vehicle_motion import FixedWing
 
 
 class PlaneHost(ArduPilotVehicle):
-    """A plane as its modes and failsafes see it."""
+    """The interface of a simulated plane for its flight modes and failsafes."""
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         self.wing: FixedWing = FixedWing(self.rng, wind=wind)

@@ -212,7 +212,7 @@ class Px4StreamRates:
 
     def on_requested(self, channel: Channel, message_id: int) -> None:
         intervals_us = self._intervals_us.get(channel, {})
-        # After a request, PX4 reports a message that is off as sent on change.
+        # After a request of a message whose stream is off, PX4 reports its interval as "on change".
         if intervals_us.get(message_id) == _OFF:
             intervals_us[message_id] = _ON_CHANGE
 

@@ -284,7 +284,7 @@ _MAX_DRIFT = 0.001  # maximum relative drift of two clocks; quartz clocks are te
 
 
 class FreshnessChecker:
-    """Used by the vehicle side: makes beacons, and checks the stamps of received datagrams."""
+    """Sends the clock of the vehicle's process in beacons, and refuses datagrams whose stamps are too old."""
 
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch

@@ -91,7 +91,8 @@ class TerminationActions(VehicleBase):
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
-            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            OperationRejected: the vehicle is armed, or not known to be disarmed, and nothing was sent; or another order
+                was given before the acknowledgement, and the autopilot may still have switched off.
             CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.
             CommandTimeout: there was no acknowledgement; the autopilot may still have switched off.
             OperationTimeout: the autopilot accepted the command, but still sends HEARTBEATs.

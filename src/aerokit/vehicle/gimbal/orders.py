@@ -57,7 +57,7 @@ class GimbalOrders:
         self.session: VehicleSession = context.session
         self.registry: GimbalRegistry = registry
         self._device = device
-        # The manager to which a claim of control was sent outside of a control block.
+        # The manager from which control was requested outside of `async with gimbal.control()`.
         self._claimed_manager_id: int | None = None
 
     @property
