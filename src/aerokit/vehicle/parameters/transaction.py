@@ -148,12 +148,14 @@ class _Block:
 
     async def _write_previous(self, cause: BaseException | None) -> None:
         answers: Mapping[str, object] = {}
-        saved: list[Parameter] = []
         reason = ""
-        with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
-            # Another block may wait long for an answer. That must not prevent this one from restoring its values.
-            async with self._registry.exclusive(self._idle_timeout_s):
-                saved = self._take_saved()
+        began_at = anyio.current_time()
+        # Another block may wait long for an answer. That must not prevent this one from restoring its values.
+        async with self._registry.exclusive(self._idle_timeout_s):
+            saved = self._take_saved()
+            # If the event loop was blocked, the wait was longer, but there must be time left to restore the values.
+            waited_s = min(anyio.current_time() - began_at, self._idle_timeout_s)
+            with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s - waited_s):
                 try:
                     names = [param.name for param in saved if self._access.written.get(param.name) is not None]
                     present = await self._access.read(names, self._idle_timeout_s)
