@@ -308,7 +308,7 @@ async def test_block_restores_while_another_one_waits_for_answers() -> None:
         assert loop.time() - ended_at <= 6.0
 
 
-async def test_block_restores_after_event_loop_was_blocked_while_another_one_waits() -> None:
+async def test_block_restores_after_blocked_loop_while_another_one_waits() -> None:
     async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
         parameters = flight.vehicle.parameters
         await parameters.download()
