@@ -326,6 +326,25 @@ async def test_block_restores_after_blocked_loop_while_another_one_waits() -> No
         assert values(flight) == BEFORE
 
 
+async def test_block_saves_no_temporary_value_of_other_block() -> None:
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        parameters, faults = flight.vehicle.parameters, flight.copter.faults
+        await parameters.download()
+
+        async def change() -> None:
+            async with parameters.temporarily({"RTL_ALT": 2500, "LAND_SPEED": 60}, idle_timeout_s=30.0):
+                assert values(flight) == (2500, 60)
+
+        async with parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=2.0):
+            faults.mute_parameters = {"LAND_SPEED"}
+            tasks.start_soon(change)
+            await anyio.sleep(1.0)
+        assert values(flight) == BEFORE
+        faults.mute_parameters = set()
+        await anyio.sleep(30.0)
+        assert values(flight) == BEFORE
+
+
 async def test_temporary_block_is_entered_once() -> None:
     async with open_flight(copter()) as flight:
         block = flight.vehicle.parameters.temporarily({"RTL_ALT": 2000})
