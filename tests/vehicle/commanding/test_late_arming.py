@@ -357,6 +357,31 @@ async def test_disarm_is_repeated_after_answer_to_earlier_arm(grounded: Flight, 
     assert not copter.is_armed
 
 
+@pytest.mark.parametrize("arm", ["undone", "cancelled", "awaited"])
+async def test_disarm_before_answers_to_earlier_arm_is_repeated(grounded: Flight, arm: str) -> None:
+    """The first command to disarm is lost. A link that duplicates frames delivers both answers to the arm after it."""
+    vehicle, copter = grounded.vehicle, grounded.copter
+    copter.parameters["DISARM_DELAY"] = 0.0
+    await vehicle.set_mode("GUIDED")
+    copter.faults.lose_ack(ARM)
+    arming = asyncio.create_task(vehicle.arm())
+    await anyio.sleep(0.05)
+    assert copter.is_armed
+    copter.faults.commands.clear()
+    copter.faults.ignore(ARM, times=1)
+    if arm != "awaited":
+        arming.cancel()
+    disarming = None if arm == "undone" else asyncio.create_task(vehicle.disarm())
+    while 0 not in ordered(grounded):  # noqa: ASYNC110
+        await anyio.sleep(0.01)
+    for _ in range(2):
+        copter.send(CommandAck(ARM, MavResult.ACCEPTED, target_system=255, target_component=190))
+    await anyio.sleep(4.0)
+    assert ordered(grounded) == [1, 0, 0]
+    assert not copter.is_armed
+    await asyncio.gather(arming, *([disarming] if disarming else []), return_exceptions=True)
+
+
 async def after_heartbeat(flight: Flight) -> None:
     """Wait for the next HEARTBEAT."""
     armed = flight.vehicle.armed

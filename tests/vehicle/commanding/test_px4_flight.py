@@ -16,7 +16,7 @@ from aerokit import messages as m
 from aerokit._internal import geo
 from aerokit.connection.cells import StateCell
 from aerokit.dronekit import flight_orders
-from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
+from aerokit.errors import CommandRejected, CommandTimeout, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.px4.modes import POSITION, custom_mode
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
@@ -374,3 +374,14 @@ async def test_lost_hold_after_setpoints_is_repeated_before_failsafe(phase_s: fl
             flight.px4.faults.ignore(MavCmd.DO_REPOSITION, times=1)
         await anyio.sleep(3.0)
         assert flight.vehicle.mode_name == "LOITER"
+
+
+@pytest.mark.parametrize(("latency_s", "max_wait_s"), [(0.0, 6.0), (0.3, 6.0), (1.0, 17.0)])
+async def test_unanswered_hold_on_slow_link_ends_in_time(latency_s: float, max_wait_s: float) -> None:
+    async with open_px4(latency_s=latency_s) as flight:
+        await flight.take_off(10.0)
+        flight.px4.faults.ignore(MavCmd.DO_REPOSITION)
+        began_at = flight.vehicle.connection.now()
+        with pytest.raises(CommandTimeout):
+            await flight.vehicle.hold()
+        assert flight.vehicle.connection.now() - began_at <= max_wait_s

@@ -8,7 +8,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Flight, open_flight, open_px4
+from flight_harness import Flight, block_loop, open_flight, open_px4
 
 from aerokit import messages
 from aerokit.errors import (
@@ -306,6 +306,43 @@ async def test_block_restores_while_another_one_waits_for_answers() -> None:
             ended_at = loop.time()
         assert values(flight) == BEFORE
         assert loop.time() - ended_at <= 6.0
+
+
+async def test_block_restores_after_blocked_loop_while_another_one_waits() -> None:
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        flight.copter.faults.mute_parameters = {"LAND_SPEED"}
+
+        async def change() -> None:
+            with pytest.raises(ParameterTimeout):
+                async with parameters.temporarily({"LAND_SPEED": 60}, idle_timeout_s=30.0):
+                    pass
+
+        async with parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=2.0):
+            tasks.start_soon(change)
+            await anyio.sleep(1.0)
+            asyncio.get_running_loop().call_later(0.5, block_loop, 10.0)
+        assert values(flight) == BEFORE
+
+
+async def test_block_saves_no_temporary_value_of_other_block() -> None:
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        parameters, faults = flight.vehicle.parameters, flight.copter.faults
+        await parameters.download()
+
+        async def change() -> None:
+            async with parameters.temporarily({"RTL_ALT": 2500, "LAND_SPEED": 60}, idle_timeout_s=30.0):
+                assert values(flight) == (2500, 60)
+
+        async with parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=2.0):
+            faults.mute_parameters = {"LAND_SPEED"}
+            tasks.start_soon(change)
+            await anyio.sleep(1.0)
+        assert values(flight) == BEFORE
+        faults.mute_parameters = set()
+        await anyio.sleep(30.0)
+        assert values(flight) == BEFORE
 
 
 async def test_temporary_block_is_entered_once() -> None:

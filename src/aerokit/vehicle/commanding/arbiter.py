@@ -319,6 +319,11 @@ class CommandArbiter:
     # ------------------------------------------------------------------------- certainty
 
     @property
+    def is_arm_command_open(self) -> bool:
+        """True while a command to arm awaits its acknowledgement."""
+        return any(sent.arms for sent in self._sent)
+
+    @property
     def is_flown_by_program(self) -> bool:
         """True if the vehicle executes orders of this program, provided that it is armed."""
         order = self.current
@@ -488,7 +493,7 @@ class CommandArbiter:
 
     def _on_arming(self) -> None:
         self._last_arming_at = self._telemetry.armed.updated_at
-        is_order_open = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
+        is_order_open = self.is_arm_command_open or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
         was_caused_by_order = was_accepted and was_armed_by_order(
             self.last_disarmed_report_at, self._arming_accepted_at

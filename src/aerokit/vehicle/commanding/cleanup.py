@@ -98,7 +98,8 @@ HOLD_CLOSE_TIMEOUT_S = 1.5
 # Maximum number of attempts to hold after an abandoned order. After a time-out, the next attempt waits for a HEARTBEAT.
 MAX_HOLD_ATTEMPTS = 3
 
-# A hold is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most MAX_HOLD_RESENDS times.
+# A hold is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most MAX_HOLD_RESENDS times; on a
+# slow link later and less often.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
 # NaN means the present position, so the vehicle brakes and does not fly back to a point that it has passed.
@@ -132,7 +133,7 @@ class FlightCleanup:
         if self._holds_by_reposition:  # PX4 may be flying to a place in LOITER, its hold mode.
             # PX4 acts on the loss of set-points after 1 s (COM_OF_LOSS_T), so a lost hold is repeated earlier.
             await self._sender.send_long(
-                order, *STOP_HERE, attempt_timeout=HOLD_ACK_TIMEOUT_S, attempts=MAX_HOLD_RESENDS
+                order, *STOP_HERE, attempt_timeout=HOLD_ACK_TIMEOUT_S, attempts=self._max_attempts
             )
             await self._sender.ensure_mode(mode, order)
         else:
@@ -147,9 +148,13 @@ class FlightCleanup:
             *params,
             modes=() if self._holds_by_reposition else (mode,),
             attempt_timeout=HOLD_ACK_TIMEOUT_S,
-            attempts=MAX_HOLD_RESENDS,
+            attempts=self._max_attempts,
             was_just_sent=True,
         )
+
+    @property
+    def _max_attempts(self) -> int:
+        return self._session.commands.attempts_in_time(MAX_HOLD_RESENDS, HOLD_ACK_TIMEOUT_S)
 
     # ---------------------------------------------------------------------- abandoned orders
 

@@ -172,10 +172,10 @@ class OrderSender:
         """
         armed, now = self._session.telemetry.armed, self._session.connection.now
         started = now()
-        arm_answered_at = self._session.commands.accepted_at(MavCmd.COMPONENT_ARM_DISARM)
+        may_be_answer_to_arm = self._may_be_answer_to_arm()
         await self.send_arm(order, armed=False, force=force)
         accepted_at = now()
-        if started - arm_answered_at > PENDING_ACK_TIMEOUT_S:
+        if not may_be_answer_to_arm:
             return accepted_at
         effect_due_at = accepted_at + ARM_HEARTBEAT_DELAY_S
         is_still_armed = False
@@ -190,6 +190,13 @@ class OrderSender:
             await self.send_arm(order, armed=False, force=force)
             return now()
         return accepted_at
+
+    def _may_be_answer_to_arm(self) -> bool:
+        """Return True if the next answer to a command to disarm may answer an earlier command to arm."""
+        commands, command = self._session.commands, MavCmd.COMPONENT_ARM_DISARM
+        is_unanswered = commands.may_get_late_ack(command, self._session.component_id)
+        answered_before_s = self._session.connection.now() - commands.accepted_at(command)
+        return self._arbiter.is_arm_command_open or is_unanswered or answered_before_s <= PENDING_ACK_TIMEOUT_S
 
     # ----------------------------------------------------------------------------------- modes
 

@@ -38,6 +38,8 @@ class RestoreRegistry:
     def __init__(self) -> None:
         self._blocks: dict[str, list[_Block]] = {}
         self._lock = asyncio.Lock()
+        self.restored: dict[str, Parameter] = {}
+        """Parameters that other blocks have restored since the last block began to save values."""
 
     @asynccontextmanager
     async def exclusive(self, timeout: float | None = None) -> AsyncIterator[None]:
@@ -87,6 +89,7 @@ class _Block:
         # The writer calls this method before each round of writes, because some parameters appear only after the first
         # round.
         async with self._registry.exclusive():
+            self._registry.restored.clear()
             return await self._resolve_and_save_locked(names, idle_timeout_s)
 
     async def _resolve_and_save_locked(
@@ -104,7 +107,8 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            current[name] = self._with_all_bits(answer)
+            # If another block did not wait for this one, the answer may be its temporary value.
+            current[name] = self._registry.restored.get(name) or self._with_all_bits(answer)
             if name not in self._saved:
                 self._saved[name] = current[name]
                 self._registry.add(name, self)
@@ -148,12 +152,15 @@ class _Block:
 
     async def _write_previous(self, cause: BaseException | None) -> None:
         answers: Mapping[str, object] = {}
-        saved: list[Parameter] = []
         reason = ""
-        with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
-            # Another block may wait long for an answer. That must not prevent this one from restoring its values.
-            async with self._registry.exclusive(self._idle_timeout_s):
-                saved = self._take_saved()
+        began_at = anyio.current_time()
+        # Another block may wait long for an answer. That must not prevent this one from restoring its values.
+        async with self._registry.exclusive(self._idle_timeout_s):
+            saved = self._take_saved()
+            self._registry.restored.update({param.name: param for param in saved})
+            # If the event loop was blocked, the wait was longer, but there must be time left to restore the values.
+            waited_s = min(anyio.current_time() - began_at, self._idle_timeout_s)
+            with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s - waited_s):
                 try:
                     names = [param.name for param in saved if self._access.written.get(param.name) is not None]
                     present = await self._access.read(names, self._idle_timeout_s)

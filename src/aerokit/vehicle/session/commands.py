@@ -11,7 +11,7 @@ from aerokit.connection.exchanges import ExchangeRun
 from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck
-from aerokit.protocols.command import CommandExchange, command_int, command_long, command_name
+from aerokit.protocols.command import MAX_ATTEMPTS, CommandExchange, command_int, command_long, command_name
 from aerokit.protocols.exchange import is_addressed_to
 
 if TYPE_CHECKING:
@@ -279,6 +279,14 @@ class CommandSender:
     def _min_attempt_timeout_s(self) -> float:
         # A round trip that was measured while the link was stalled would make the wait too long.
         return min(MIN_ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
+
+    def attempts_in_time(self, attempts: int, attempt_timeout: float) -> int:
+        """Return how many attempts fit into the time of ``attempts`` on a fast link; at least `MAX_ATTEMPTS`.
+
+        On a slow link, each attempt takes longer than ``attempt_timeout``.
+        """
+        slow_timeout_s = max(attempt_timeout, self._min_attempt_timeout_s())
+        return max(MAX_ATTEMPTS, int(attempts * attempt_timeout / slow_timeout_s))
 
     def _acks_of(self, command: int) -> int:
         # PX4 sends two acks for some commands.
