@@ -378,7 +378,7 @@ async def test_disarm_before_answers_to_earlier_arm_is_repeated(grounded: Flight
         copter.send(CommandAck(ARM, MavResult.ACCEPTED, target_system=255, target_component=190))
     await anyio.sleep(4.0)
     assert ordered(grounded) == [1, 0, 0]
-    assert not copter.is_armed
+    assert not grounded.copter.is_armed
     await asyncio.gather(arming, *([disarming] if disarming else []), return_exceptions=True)
 
 
