@@ -160,7 +160,7 @@ def _px4_letters(item: MissionItem) -> str:
 
 
 def _stored_as(letter: str, value: float) -> Iterator[float]:
-    """Yield the value that an autopilot sends back after it has stored ``value`` in this form.
+    """Yield ``value`` as an autopilot sends it back if it has stored it in the form that ``letter`` stands for.
 
     Yields nothing if the autopilot cannot store the value.
     """

@@ -212,8 +212,7 @@ class Motion:
 
     def follow_trajectory(self, velocity: Ned, acceleration: Ned) -> None:
         """Seek a velocity with a feed-forward acceleration; only the lean limits the horizontal acceleration."""
-        self._set_target(velocity)
-        self._feed_forward = acceleration
+        self._set_target(velocity, feed_forward=acceleration)
 
     def seek_acceleration(self, north: float, east: float, down: float) -> None:
         self._set_target((north, east, down), is_acceleration=True)
@@ -223,10 +222,15 @@ class Motion:
         self._set_target((0.0, 0.0, velocity_down), lean=(roll, pitch))
 
     def _set_target(
-        self, target: Ned, *, is_acceleration: bool = False, lean: tuple[float, float] | None = None
+        self,
+        target: Ned,
+        *,
+        is_acceleration: bool = False,
+        feed_forward: Ned = (0.0, 0.0, 0.0),
+        lean: tuple[float, float] | None = None,
     ) -> None:
         self._target = target
-        self._feed_forward = (0.0, 0.0, 0.0)
+        self._feed_forward = feed_forward
         self._target_is_acceleration = is_acceleration
         self._target_lean = lean
 

@@ -13,6 +13,7 @@ from difflib import get_close_matches
 from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavParamType
 from aerokit.parameters import Parameter, ParameterType
+from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.pack import HEADER, MAGIC, pack_for_download, read_entry, read_header
 from aerokit.protocols.servers.files import EINVAL, ENOENT, FileFault, FileHandle, Mount, UploadedFile
 
@@ -129,7 +130,7 @@ class SimParameters:
     def index(self, name: str) -> int:
         """Return the position of a name in ``names``, or 65535 if it is hidden."""
         _ = self.names  # Reading the property updates `_indices`.
-        return self._indices.get(name, 0xFFFF)
+        return self._indices.get(name, UNKNOWN_INDEX)
 
     def type(self, name: str) -> int:
         return self.row(name).type

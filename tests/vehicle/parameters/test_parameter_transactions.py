@@ -289,19 +289,20 @@ async def test_ends_of_several_blocks_are_bounded_for_silent_vehicle() -> None:
         assert not_restored == before
 
 
+async def await_muted_parameter(parameters: Parameters) -> None:
+    with pytest.raises(ParameterTimeout):
+        async with parameters.temporarily({"LAND_SPEED": 60}, idle_timeout_s=30.0):
+            pass
+
+
 async def test_block_restores_while_another_one_waits_for_answers() -> None:
     async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
         parameters, loop = flight.vehicle.parameters, asyncio.get_running_loop()
         await parameters.download()
         flight.copter.faults.mute_parameters = {"LAND_SPEED"}
 
-        async def change() -> None:
-            with pytest.raises(ParameterTimeout):
-                async with parameters.temporarily({"LAND_SPEED": 60}, idle_timeout_s=30.0):
-                    pass
-
         async with parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=2.0):
-            tasks.start_soon(change)
+            tasks.start_soon(await_muted_parameter, parameters)
             await anyio.sleep(1.0)
             ended_at = loop.time()
         assert values(flight) == BEFORE
@@ -314,13 +315,8 @@ async def test_block_restores_after_blocked_loop_while_another_one_waits() -> No
         await parameters.download()
         flight.copter.faults.mute_parameters = {"LAND_SPEED"}
 
-        async def change() -> None:
-            with pytest.raises(ParameterTimeout):
-                async with parameters.temporarily({"LAND_SPEED": 60}, idle_timeout_s=30.0):
-                    pass
-
         async with parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=2.0):
-            tasks.start_soon(change)
+            tasks.start_soon(await_muted_parameter, parameters)
             await anyio.sleep(1.0)
             asyncio.get_running_loop().call_later(0.5, block_loop, 10.0)
         assert values(flight) == BEFORE

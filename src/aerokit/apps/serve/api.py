@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from aerokit.apps.serve.served_vehicles import ServedVehicles
     from aerokit.missions import Fence, Mission, MissionItem, RallyPoints
     from aerokit.parameters import Metadata, Parameter
+    from aerokit.vehicle.missions.context import PlanVersion
     from aerokit.vehicle.vehicle import Vehicle
 
 _ABOUT = """State, missions, parameters and orders of MAVLink vehicles (docs/serve.md of aerokit).
@@ -277,9 +278,9 @@ class Operation:
 class _Download:
     plan: Mission | Fence | RallyPoints
     received_at: float
-    version: tuple[int, int]
+    version: PlanVersion
 
-    def is_outdated(self, version: tuple[int, int], count: int | None) -> bool:
+    def is_outdated(self, version: PlanVersion, count: int | None) -> bool:
         """Return True if the plan's version has changed, or the vehicle reports another number of items."""
         return version != self.version or count not in (None, len(self.plan.to_items()))
 

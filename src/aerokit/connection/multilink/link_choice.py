@@ -58,7 +58,7 @@ class Candidate:
         """True if :attr:`hardware` is another vehicle's id. A matching clock or copies then prove nothing."""
         # Numbers of requests for the hardware id, and of TIMESYNC answers since the first request.
         self._hardware_requests = self._answers_since_request = 0
-        # Numbers of consecutive matches and mismatches of the clock, and of copies since the last reset.
+        # How often the clock matched and did not match in succession, and number of copies. A reboot resets them.
         self._clock_matches = self._clock_mismatches = self._copies = 0
         self._last_counts = (0, 0)  # numbers of frames received and lost at the last call of `record_counts`
 

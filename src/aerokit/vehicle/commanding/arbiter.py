@@ -347,12 +347,10 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        if order is not None and order.takeover_reason:
-            may_be_own_change = not order.modes  # A raw command without modes may have changed the mode itself.
-            has_newer_order = not order.is_newest  # The vehicle may be executing the newer order, which is posted.
-            if not may_be_own_change and not has_newer_order:
-                return "arm" in topics  # A takeover does not undo an order to arm.
-        return bool(topics)
+        # A raw command without modes may have changed the mode itself. A newer order is posted, and may be executed.
+        was_taken_over = order is not None and bool(order.takeover_reason) and bool(order.modes) and order.is_newest
+        # A takeover does not undo an order to arm.
+        return "arm" in topics if was_taken_over else bool(topics)
 
     @property
     def is_state_recent(self) -> bool:

@@ -181,14 +181,15 @@ class FlightActions(VehicleBase):
 
         # The vehicle keeps the altitude that it climbs to when home moves: PX4 corrects the altitude of home in flight,
         # and `set_home` may be called during the climb.
-        target_amsl_m = plan.params[6] if is_amsl else -math.inf
+        target_amsl_m: float | None = plan.params[6] if is_amsl else None
 
         def missing_m() -> float:
             nonlocal target_amsl_m
-            climb_m = altitude_m - self._position.altitude_relative()
-            if target_amsl_m == -math.inf and self._position.was_received_since(started):
-                target_amsl_m = self._position.altitude_amsl() + climb_m
-            return target_amsl_m - self._position.altitude_amsl() if math.isfinite(target_amsl_m) else climb_m
+            here_m, climb_m = self._position.altitude_amsl(), altitude_m - self._position.altitude_relative()
+            is_known = self._position.was_received_since(started) and math.isfinite(here_m + climb_m)
+            if target_amsl_m is None and is_known:
+                target_amsl_m = here_m + climb_m
+            return climb_m if target_amsl_m is None else target_amsl_m - here_m
 
         def is_up() -> bool:
             return self._position.was_received_since(started) and missing_m() <= tolerance_m and not order.end

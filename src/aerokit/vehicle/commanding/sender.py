@@ -48,6 +48,26 @@ def add_clause(error: AerokitError, clause: str) -> None:
     error.args = (f"{text}; {clause}{newline}{reasons}",)
 
 
+@contextmanager
+def adding_clause(order: Order, clause: str) -> Iterator[None]:
+    """Append a clause to the error of a command that was sent, but neither refused nor acknowledged."""
+    try:
+        yield
+    except CommandRejected:  # The vehicle certainly does not execute the command.
+        raise
+    except (CommandTimeout, OperationRejected) as error:
+        if order.was_sent:
+            add_clause(error, clause)
+        raise
+
+
+def revoked_acceptance(operation: str, command: int, result: int) -> CommandRejected:
+    """Return the error of a command that the vehicle has refused after an earlier acceptance."""
+    error = rejection(command, result)
+    error.args = (f"{operation}: {ACCEPTANCE_REVOKED}: {error}",)
+    return error
+
+
 class OrderSender:
     """Sends the MAVLink commands that carry out an order, and repeats them only as docs/reliability.md allows."""
 
@@ -326,8 +346,7 @@ class OrderSender:
             if not refusals:
                 raise
             order.was_refused = True
-            error = rejection(refusals[-1].command, refusals[-1].result)
-            error.args = (f"{operation}: {ACCEPTANCE_REVOKED}: {error}",)
+            error = revoked_acceptance(operation, refusals[-1].command, refusals[-1].result)
             raise self._session.with_reasons(error, started) from None
 
     async def ensure_mode(self, mode: Mode, order: Order) -> None:
@@ -398,10 +417,12 @@ class OrderSender:
 
         return failure_reason
 
-    async def auxiliary_command(self, command: int, *params: float, **options: Any) -> None:
-        """Send a command that changes a setting and does not steer."""
+    async def auxiliary_command(
+        self, command: int, *params: float, device_order: Order | None = None, **options: Any
+    ) -> None:
+        """Send a command that changes a setting or a device and does not steer, as a part of ``device_order``."""
         is_repeatable = allowed_attempts(command, params) > 1
-        with self._arbiter.auxiliary_order(ends_with_actions=is_repeatable) as order:
+        with self._arbiter.auxiliary_order(device_order, ends_with_actions=is_repeatable) as order:
             await self.send_long(order, command, *params, **options)
 
     # ---------------------------------------------------------------------------- raw commands

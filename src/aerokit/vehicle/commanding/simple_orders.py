@@ -17,7 +17,6 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
-from aerokit.protocols.command import allowed_attempts
 from aerokit.vehicle.commanding.order import SUPERSEDED
 from aerokit.vehicle.commanding.progress import await_progress
 
@@ -137,9 +136,9 @@ class SimpleOrder(Snapshot):
             self.check_supported(context)
         if topic is not None and device_order is None:
             device_order = context.arbiter.device_order(topic)
-        is_repeatable = allowed_attempts(self.command, params) > 1
-        with context.arbiter.auxiliary_order(device_order, ends_with_actions=is_repeatable) as order:
-            await context.sender.send_long(order, self.command, *params, component_id=component_id)
+        await context.sender.auxiliary_command(
+            self.command, *params, device_order=device_order, component_id=component_id
+        )
         if self.effect is not None:
             target = context.session.component_id if component_id is None else component_id
             await self._await_effect(context, self.effect, values, device_order, target, timeout)

@@ -6,11 +6,11 @@ from contextlib import suppress
 from typing import Any, Literal
 
 from aerokit._internal.arguments import checks_arguments
-from aerokit.errors import CommandRejected, CommandTimeout, LinkLost, NotSupported, OperationRejected
+from aerokit.errors import LinkLost, NotSupported
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
-from aerokit.vehicle.commanding.sender import add_clause
+from aerokit.vehicle.commanding.sender import adding_clause
 
 TerminationIntent = Literal["terminate flight"]
 ShutdownIntent = Literal["shut down"]
@@ -51,15 +51,9 @@ class TerminationActions(VehicleBase):
         modes = self.autopilot.modes_of_command(MavCmd.DO_FLIGHTTERMINATION, (TERMINATE,))
         self._arm_cleanup.stop()
         order = self._arbiter.order(*modes, ends_flight=True)
-        try:
+        with adding_clause(order, "the flight may have been terminated nevertheless"):
             command = MavCmd.DO_FLIGHTTERMINATION
             await self._sender.send_long(order, command, TERMINATE, modes=modes, armed=False, **SEND_ONCE)
-        except CommandRejected:
-            raise
-        except (CommandTimeout, OperationRejected) as error:
-            if order.was_sent:
-                add_clause(error, "the flight may have been terminated nevertheless")
-            raise
         armed, state = self.telemetry.armed, self.telemetry.system_status
 
         def is_terminated() -> bool:
@@ -101,15 +95,11 @@ class TerminationActions(VehicleBase):
         if not self.autopilot.can_shut_down:
             raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
         self._session.check_disarmed("shutdown")
-        with self._arbiter.auxiliary_order(ends_with_actions=False) as order:
-            try:
-                await self._sender.send_long(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
-            except CommandRejected:
-                raise
-            except (CommandTimeout, OperationRejected) as error:
-                if order.was_sent:
-                    add_clause(error, "the autopilot may have switched off nevertheless")
-                raise
+        with (
+            self._arbiter.auxiliary_order(ends_with_actions=False) as order,
+            adding_clause(order, "the autopilot may have switched off nevertheless"),
+        ):
+            await self._sender.send_long(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
         with suppress(LinkLost):  # The link may go down with the autopilot.
             await await_progress(
                 self._session,

@@ -12,8 +12,7 @@ from aerokit.autopilots import GimbalRules
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink.enums import GimbalManagerFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.messages import GimbalManagerInformation, MountConfigure, MountControl
-from aerokit.protocols.command import rejection
-from aerokit.vehicle.commanding.sender import ACCEPTANCE_REVOKED
+from aerokit.vehicle.commanding.sender import revoked_acceptance
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -312,9 +311,7 @@ class GimbalOrders:
         for command in AIMING_COMMANDS:
             result = self.session.commands.late_refusal(command, self.manager_id, since)
             if result is not None:
-                error = rejection(command, result)
-                error.args = (f"{description}: {ACCEPTANCE_REVOKED}: {error}",)
-                raise error
+                raise revoked_acceptance(description, command, result)
 
     @property
     def is_taken(self) -> bool:

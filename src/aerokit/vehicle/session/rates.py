@@ -197,6 +197,7 @@ class MessageRates:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
                 self._watch(stream)
+            # A stream whose last request was not answered may be due again. All other changes set the event themselves.
             if any(stream.failures for stream in self._streams.values()):
                 self._has_due_streams.set()
 

@@ -315,7 +315,8 @@ class Telemetry(States):
 
 def _is_from_other_message(cell: StateCell[Any], source: Source) -> bool:
     """Return True if the value of the cell is from another message type than ``source``."""
-    return cell.source is not None and cell.source.message != source.message
+    latest = cell.source
+    return latest is not None and latest.message != source.message
 
 
 def is_reported_on_ground(vehicle: States, *, max_age_s: float = LANDED_STATE_MAX_AGE_S) -> bool:
