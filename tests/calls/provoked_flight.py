@@ -119,6 +119,10 @@ def _order_to_arm(stage: Stage) -> None:
     stage.vehicle.send(messages.CommandLong(1, 1, Cmd.COMPONENT_ARM_DISARM, 0, 1, *[0.0] * 6))
 
 
+def _order_to_land(stage: Stage) -> None:
+    stage.vehicle.send(messages.CommandLong(1, 1, Cmd.NAV_LAND, 0, *[0.0] * 7))
+
+
 def _actions() -> Table:
     reboot, arm, mode = Cmd.PREFLIGHT_REBOOT_SHUTDOWN, Cmd.COMPONENT_ARM_DISARM, Cmd.DO_SET_MODE
     command = _method("command", Cmd.DO_SET_HOME, 1)
@@ -285,6 +289,9 @@ def _maneuvers() -> Table:
     patient = _method("terminate", intent="terminate flight", timeout=30)
     shut_down = _method("shutdown", intent="shut down", timeout=2)
     rows: Table = {
+        ("Vehicle.terminate", "OperationRejected"): later(
+            terminate, _order_to_land, 0.3, airborne, before=ignored(end)
+        ),
         ("Vehicle.terminate", "HeartbeatTimeout"): later(patient, stops_sending, 0.3, before=accepted(end)),
         ("Vehicle.terminate", "OperationTimeout"): P(terminate, airborne, accepted(end)),
         ("Vehicle.shutdown", "NotSupported"): P(shut_down, grounded),

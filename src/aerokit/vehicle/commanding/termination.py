@@ -44,6 +44,8 @@ class TerminationActions(VehicleBase):
             CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses the command while
                 disarmed.
             CommandTimeout: there was no acknowledgement; the flight may still have been terminated.
+            OperationRejected: another order was given, or another party took over, before the acknowledgement; the
+                flight may still have been terminated.
             HeartbeatTimeout: the vehicle accepted the command, but its last HEARTBEAT is ten seconds old.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
