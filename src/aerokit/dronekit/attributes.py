@@ -121,7 +121,7 @@ class VehicleAttributes(VehicleCore):
     _dk_ekf_flags: int | None = None
     _dk_ekf_ok = False
     _home_location: LocationGlobal | None = None
-    _dk_reported_home: LocationGlobal | None = None
+    _dk_confirmed_home: LocationGlobal | None = None  # unlike _home_location, never a home that may be refused
 
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
@@ -290,9 +290,8 @@ class VehicleAttributes(VehicleCore):
     def _dk_set_home(self, lat: float, lon: float, alt: float | None) -> None:
         home = LocationGlobal(lat, lon, alt)
         self._home_location = home
-        self._dk_reported_home = home
+        self._dk_confirmed_home = home
 
-    def _dk_forget_home(self) -> None:
-        # The vehicle has rebooted, perhaps at another place, and altitudes depend on home.
+    def _dk_on_reboot(self) -> None:
         self._home_location = None
-        self._dk_reported_home = None
+        self._dk_confirmed_home = None

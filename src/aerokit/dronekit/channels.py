@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MIN_CHANNELS = 8
 MAX_MICROSECONDS = 0xFFFF
-UNUSED = 0xFFFF  # The channel does not exist (RC_CHANNELS), or stays unchanged (RC_CHANNELS_OVERRIDE).
+NO_CHANNEL = 0xFFFF  # value of a channel that does not exist, in RC_CHANNELS and RC_CHANNELS_RAW
 NUMBERS = tuple(str(number) for number in range(1, MAX_CHANNELS + 1))
 ALL_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS))
 FIRST_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS[:MIN_CHANNELS]))
@@ -53,7 +53,7 @@ class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
 
     @classmethod
     def fromkeys(cls, channels: Iterable[Any], value: Any = None) -> dict[Any, Any]:
-        # Return a plain dict, because instances of this class belong to a vehicle.
+        # Return a plain dict, because this class cannot be created without a vehicle.
         return dict.fromkeys(channels, value)
 
 
@@ -129,7 +129,7 @@ class Channels(_ChannelDict):
         """Store the values of consecutive channels, from number ``first_index + 1`` on."""
         with self._changing:
             numbers = NUMBERS[first_index : self._count]
-            values = (None if value == UNUSED else value for value in received)
+            values = (None if value == NO_CHANNEL else value for value in received)
             # One call, so that other threads see all new values or none.
             dict.update(self, dict(zip(numbers, values, strict=False)))
         self._core.listeners.notify("channels", self)
@@ -150,9 +150,9 @@ class ChannelsOverride(_ChannelDict):
     Channels above 8 that this program has not overridden are left as they are.
 
     **Nothing is repeated**: the vehicle ends overrides when it receives none for a while (ArduPilot: RC_OVERRIDE_TIME,
-    3 s), which makes a hanging program safe. To hold a stick, set it several times a second. All channels are released
-    when the connection ends (``connect(release_overrides=)``), unless the process is killed. ArduPilot accepts
-    overrides only from its own ground station (``connect(source_system=)`` and MAV_GCS_SYSID, 255).
+    3 s), so that a hanging program loses control. To keep an override, set it several times a second. All channels are
+    released when the connection ends (``connect(release_overrides=)``), unless the process is killed. ArduPilot accepts
+    overrides only from the system id in its parameter MAV_GCS_SYSID (255, like ``connect(source_system=)``).
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
@@ -160,7 +160,7 @@ class ChannelsOverride(_ChannelDict):
         self._core = core_of(vehicle)
         self.count = MIN_CHANNELS
         """Number of channels that can be overridden."""
-        self._released: set[str] = set()  # channels above 8 in this set are released again with every message
+        self._released: set[str] = set()  # released channels; every message releases those above 8 again
         self._changing = threading.RLock()  # held while a change is checked and its message is sent
 
     def __setitem__(self, channel: str | int, value: float | None) -> None:

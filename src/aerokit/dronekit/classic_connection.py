@@ -51,7 +51,7 @@ class ClassicConnection:
         self.target_system = target_system
         """System id of the vehicle, 0 until it is found."""
         self.listener_thread: ListenerThread = ListenerThread()
-        self.listener_thread.on_called = loop.activity.feed  # Each callback shows that the program does not hang.
+        self.listener_thread.on_called = loop.activity.feed  # Our HEARTBEAT stops without such activity.
         self.loop = loop
         self._context = context  # the context manager of `open_connection`; close() exits it
         self.connection: Connection = context.value
@@ -147,7 +147,7 @@ def _on_dropped(
     listener_thread: ListenerThread,
     close_callbacks: list[Callable[[], object]],
 ) -> None:
-    """Clean up on the loop after the program dropped the connection without closing it."""
+    """Clean up, on the loop, after a connection that was garbage-collected without close()."""
     vehicle_logger.warning("the connection to %s was closed: the program dropped it without close()", address)
     atexit.unregister(exit_callback)
     listener_thread.stop()
@@ -278,7 +278,7 @@ RELEASE_UPPER = 0xFFFE  # releases a channel above 8; 0 leaves such a channel un
 MAVLINK_1_CHANNELS = 8  # MAVLink 2 adds channels above this number to RC_CHANNELS_OVERRIDE.
 MAX_CHANNELS = 18
 
-RELEASE_COPIES = 3  # The message is not acknowledged, and a frame may be lost.
+RELEASE_COPIES = 3  # RC_CHANNELS_OVERRIDE is not acknowledged, and a frame may be lost.
 
 
 class OverrideRelease:

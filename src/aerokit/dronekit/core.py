@@ -99,9 +99,8 @@ class LatestMessage(Generic[MessageT]):
         self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
-        # Attributes whose listeners the handlers notify; empty if the handlers do more than that. A message for which
-        # these attributes have no listeners is decoded later.
-        self._notified_names: set[str] = set()
+        self._notified_names: set[str] = set()  # attributes whose listeners the handlers notify
+        self._needs_every_message = False  # True if a handler does more than notify these listeners
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
         self._decoded: MessageT | None = None  # cache of the property `message`; may be older than `_latest`
@@ -126,6 +125,7 @@ class LatestMessage(Generic[MessageT]):
     def add(self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None) -> None:
         self._handlers.append(handler)
         self._notified_names.update(names)
+        self._needs_every_message = self._needs_every_message or not names
         if listeners is not None:
             self._listeners.append(listeners)
 
@@ -146,8 +146,7 @@ class LatestMessage(Generic[MessageT]):
     def _must_decode(self) -> bool:
         """Return True if a handler needs the message now."""
         names = self._notified_names
-        # Without names, the handlers need each message. With names, they need it until all attributes have a value.
-        if not names or not names <= self._ready_names:
+        if self._needs_every_message or not names <= self._ready_names:
             return True
         for listeners in self._listeners:
             by_name = listeners.by_name
@@ -221,8 +220,7 @@ class Core:
         Add the handler before the vehicle is connected. It is called on the loop thread, as long as the `Core` exists.
 
         If the handler only notifies the listeners of attributes, pass the ``names`` of the attributes. When all of them
-        have a value, the handler is called only if they have listeners (on the vehicle or in ``listeners``). Pass names
-        for all handlers of a message type or for none, because the handlers are called together.
+        have a value, messages for which there are no listeners (on the vehicle or in ``listeners``) may be skipped.
         """
         if message_type not in self._latest:
             self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)
@@ -299,13 +297,12 @@ class Core:
 
 
 def _recording_activity(original: property) -> property:
-    """Wrap a property, so that reading it keeps our heartbeat going."""
+    """Wrap a property, so that reading it counts as activity of the program. Without activity, our HEARTBEAT stops."""
     getter = original.fget
     assert getter is not None
 
     @functools.wraps(getter)
     def recording_getter(vehicle: VehicleCore) -> Any:
-        # Reading an attribute shows that the program is running.
         vehicle._dk.handler.loop.feed()
         return getter(vehicle)
 
@@ -389,5 +386,4 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    # For classes whose constructors take the vehicle, as in DroneKit.
     return vehicle._dk

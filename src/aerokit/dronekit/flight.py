@@ -105,7 +105,7 @@ class FlightMethods(VehicleAttributes):
             self._dk.check_link()
 
     def _dk_reports_armed(self, value: bool) -> bool:
-        # An old report of a disarmed vehicle does not count, because a pilot may have armed it since.
+        # An old HEARTBEAT of a disarmed vehicle is not trusted, because a pilot may have armed it since.
         return self._armed == value and (value or not self._dk_is_heartbeat_old)
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
@@ -162,9 +162,9 @@ class FlightMethods(VehicleAttributes):
         aio = self._dk.check_link()
         order_take_off = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
         if not aio.autopilot.repositions_amsl:
-            # ArduPilot takes the altitude above home, and does not change the mode when it gets this command.
-            params = (0, 0, 0, 0, 0, 0, altitude)
-            return order_take_off((), MavCmd.NAV_TAKEOFF, *params)
+            # ArduPilot takes the altitude above home, and stays in its mode during the take-off.
+            unchanged_mode, params = (), (0, 0, 0, 0, 0, 0, altitude)
+            return order_take_off(unchanged_mode, MavCmd.NAV_TAKEOFF, *params)
         plan = aio.autopilot.take_off(altitude, self._dk_home_altitude(), is_vtol=aio.is_vtol)
         mode = aio.autopilot.mode_for("take_off")
         if plan is None or plan.command is None or mode is None:
@@ -279,12 +279,12 @@ class FlightMethods(VehicleAttributes):
         order.add_done_callback(functools.partial(self._dk_on_home_answer, self._home_location))
 
     def _dk_on_home_answer(self, new: LocationGlobal, order: Future[None]) -> None:
-        """Restore the home that the vehicle reported last, if it rejects the new one or does not answer."""
+        """Confirm the new home if the vehicle has accepted it; restore the old one on a rejection or a time-out."""
         error = order.exception()
         if error is None:
-            self._dk_reported_home = new
+            self._dk_confirmed_home = new
         elif isinstance(error, (CommandRejected, OperationTimeout)):
-            self._home_location = self._dk_reported_home
+            self._home_location = self._dk_confirmed_home
 
     def _dk_home_altitude(self) -> float:
         """Return home's altitude above sea level. Request home if it is unknown."""

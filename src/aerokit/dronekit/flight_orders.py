@@ -78,7 +78,7 @@ def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
 
 
 def _px4_base_mode(name: str) -> int:
-    # pymavlink's MAV_MODE_FLAG for a mode. PX4 evaluates only the flag for custom modes.
+    # pymavlink sends these flags. PX4 evaluates only CUSTOM_MODE_ENABLED.
     from pymavlink.mavutil import px4_map
 
     base_mode, *_ = px4_map.get(name, (CUSTOM_MODE_ENABLED,))
@@ -158,10 +158,9 @@ async def go_to(vehicle: AsyncVehicle, target: Target) -> None:
             )
         except CommandRejected as error:
             is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
-            # Send a set-point instead of an unsupported command. The order must not have ended because of a newer order
-            # or mode change, and the vehicle must not be silent.
-            may_still_order = not order.end and vehicle.heartbeat_age <= MODE_MAX_AGE_S
-            if not is_unsupported or not may_still_order:
+            is_overruled = bool(order.end)  # by a newer order or a mode change
+            is_silent = vehicle.heartbeat_age > MODE_MAX_AGE_S
+            if not is_unsupported or is_overruled or is_silent:
                 raise
             set_point = m.SetPositionTargetGlobalInt(
                 time_boot_ms=0, target_system=vehicle.system_id, target_component=0,
@@ -173,11 +172,12 @@ async def go_to(vehicle: AsyncVehicle, target: Target) -> None:
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which a reposition command is sent to PX4; empty for other autopilots."""
-    # Other autopilots do not change the mode, and refuse the command in unsuitable modes.
+    """Return the modes in which DO_REPOSITION may be sent to PX4, which then changes to the first of them.
+
+    Empty for other autopilots, which refuse the command in unsuitable modes, and do not change the mode.
+    """
     if not aio.autopilot.repositions_amsl:  # not PX4
         return ()
-    # PX4 changes to the first of these modes.
     purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
     modes = map(aio.autopilot.mode_for, purposes)
     return tuple(mode for mode in modes if mode is not None)
@@ -227,9 +227,9 @@ class CurrentCommand:
             return 0
         if self._core.aio.autopilot.home_is_item_0:
             return int(message.seq)
-        # An item that the program has just set counts even if no mission is active yet.
+        # An item that the program has just set is returned even if the mission is not active yet.
         is_requested = message.seq == self._requested_index
-        if message.total == NO_MISSION or (self._is_no_mission_active(message) and not is_requested):
+        if message.total == NO_MISSION or (self._is_mission_inactive(message) and not is_requested):
             return 0
         return int(message.seq) + 1
 
@@ -243,7 +243,7 @@ class CurrentCommand:
         if message.seq != self._requested_index:
             self._requested_index = None
 
-    def _is_no_mission_active(self, message: m.MissionCurrent) -> bool:
+    def _is_mission_inactive(self, message: m.MissionCurrent) -> bool:
         is_at_start_or_end = message.seq == 0 or message.mission_state == MissionState.COMPLETE
         return is_at_start_or_end and not self._core.aio.is_armed
 

@@ -72,7 +72,7 @@ class Gimbal(GimbalPrivates):
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
             roll: degrees from the horizon. With a roll other than 0, the camera points at ``yaw`` only at first, and
-                then turns with the vehicle, because MAVLink's older mount command is sent.
+                then turns with the vehicle, because DO_MOUNT_CONTROL is sent.
             yaw: degrees clockwise from north.
         """
         pitch = _checked("pitch", pitch)
@@ -82,7 +82,7 @@ class Gimbal(GimbalPrivates):
         self._core.order("gimbal", gimbal.point, pitch, yaw, roll_deg=roll, wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
-        """Point the camera at a location; a copter without a gimbal turns itself. A location of zeros ends this."""
+        """Point the camera at a location; a copter without a gimbal turns itself. Zeros end the pointing."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_all_zeros = not any(checked_location(roi))
@@ -113,8 +113,7 @@ class Gimbal(GimbalPrivates):
 
 
 async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
-    # For autopilots that take altitudes above sea level, the conversion needs home. It may still be unknown right after
-    # connecting.
+    # PX4 takes altitudes above sea level. Home, which the conversion needs, may be unknown right after connecting.
     if aio.autopilot.repositions_amsl:
         await aio.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
     await aio.look_at(target)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
-# Messages are stored from the first access on. For this long after it, look-ups wait for missing messages.
+# Messages are stored from the first access to `Master.messages` on. A look-up this soon after it waits for the message.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
 

@@ -94,7 +94,7 @@ class Listeners:
             self.deliver(name, value)
         elif waits:
             self._thread.call(self.deliver, name, value)
-        elif cache:  # A change must not be lost, so the call may not be dropped.
+        elif cache:  # A change is reported only once, so it must not be dropped.
             self._thread.post(self.deliver, name, value)
         else:
             self._thread.post_or_drop(self.deliver, name, value)
@@ -174,7 +174,7 @@ class HasObservers:
 
 
 class MessageListeners(Listeners):
-    """Message listeners of a vehicle, called on the listener thread. Imports pymavlink for the first listener.
+    """Message listeners of a vehicle, called on the listener thread. Adding the first listener imports pymavlink.
 
     Listeners get the messages of all components of the vehicle, and of other systems that are not vehicles, such as
     radios and ground stations.

@@ -39,10 +39,9 @@ VERSION_TIMEOUT_S = 1.0
 READ_TIMEOUT_S = 30.0
 RETRY_DELAY_S = 1.0
 
-# The time-out of each attempt to set a parameter is ROUND_TRIPS round trips of the link, and at least MIN_ATTEMPT_S.
-# For the last attempt, it is multiplied by LAST_WAIT_SHARE.
-MIN_ATTEMPT_S, ROUND_TRIPS = 1.0, 3
-LAST_WAIT_SHARE = 0.5
+# Time-out of one attempt to set a parameter, in round trips of the link and in seconds; the longer time applies.
+ATTEMPT_ROUND_TRIPS, MIN_ATTEMPT_TIMEOUT_S = 3, 1.0
+LAST_ATTEMPT_SHARE = 0.5  # the last attempt has this share of the time-out
 
 ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an integer
 
@@ -117,8 +116,7 @@ class ParameterDownload:
         try:
             answers = (await self._core.aio.parameters.probe(*names, idle_timeout_s=READ_TIMEOUT_S)).values()
         except AerokitError:
-            # While the vehicle sends the list, it may ignore requests, so the parameter may exist.
-            return False
+            return False  # A vehicle that is sending the list may ignore requests, so the parameter may exist.
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
         # Only a rejection with a code is an answer of the vehicle.
@@ -189,7 +187,7 @@ class ParameterValues:
 
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
     """Set a parameter. Return None if the vehicle confirms the value, otherwise the error."""
-    idle_timeout_s = (retries + LAST_WAIT_SHARE) * _attempt_s(aio)
+    idle_timeout_s = (retries + LAST_ATTEMPT_SHARE) * _attempt_timeout_s(aio)
     try:
         parameter = aio.parameters.known(name) or await aio.parameters.read(name, idle_timeout_s=idle_timeout_s)
         # Values of integer parameters are truncated, as in ArduPilot.
@@ -218,13 +216,11 @@ def convert_to_type(name: str, value: float, type: ParameterType) -> int | float
     return checked_value(name, value, type)
 
 
-def _attempt_s(aio: AsyncVehicle) -> float:
-    """Return the seconds to allow for one attempt to set a parameter."""
+def _attempt_timeout_s(aio: AsyncVehicle) -> float:
     report = aio.link_quality.latest
     if report is None or report.round_trip_s is None:
-        return MIN_ATTEMPT_S
-    # Slow links need more time.
-    return max(MIN_ATTEMPT_S, ROUND_TRIPS * report.round_trip_s)
+        return MIN_ATTEMPT_TIMEOUT_S
+    return max(MIN_ATTEMPT_TIMEOUT_S, ATTEMPT_ROUND_TRIPS * report.round_trip_s)
 
 
 WAIT_TIMEOUT_S = 30.0

@@ -269,7 +269,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         # The event loop keeps these callbacks, so weak references let the vehicle be garbage collected. `_handler` may
         # have strong ones, because it belongs to this vehicle.
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
-        aio._session.on_reboot.append(weak_callback(self._dk_forget_home))
+        aio._session.on_reboot.append(weak_callback(self._dk_on_reboot))
         # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.
         first_heartbeat = aio.connection.heartbeats.get((aio.system_id, aio.component_id))
         if first_heartbeat is not None:
