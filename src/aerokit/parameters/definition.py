@@ -367,7 +367,7 @@ class _Reader:
     def __init__(self, root: Element) -> None:
         self._root = root
         nodes = list(root.iterfind("parameters/parameter"))
-        # If a setting is defined several times, the first definition is used. It must therefore enter the dict last.
+        # Reversed, because the first definition counts if a setting is defined several times.
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:
@@ -377,8 +377,7 @@ class _Reader:
         for node in root.iterfind("parameters/parameter"):
             setting = self._setting(node)
             if setting is not None:
-                # If a setting is defined several times, the first definition is used.
-                settings.setdefault(setting.name, setting)
+                settings.setdefault(setting.name, setting)  # the first definition counts
         translations: dict[str, Mapping[str, str]] = {}
         for node in root.iterfind("localization/locale"):
             texts = {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}

@@ -52,10 +52,7 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
 
 
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
-    """Return the value in a PARAM_VALUE, exact to the bit if the message was received.
-
-    A fraction or NaN that a vehicle sends for an integer type is returned as a float.
-    """
+    """Return the value in a message; a fraction or NaN that a vehicle sends for an integer type remains a float."""
     type_ = ParameterType.from_wire(message.param_type)
     if bytewise and type_ in _FORMATS:
         return int(_FORMATS[type_].unpack_from(_exact_bits(message))[0])

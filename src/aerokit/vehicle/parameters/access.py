@@ -38,10 +38,10 @@ ANSWER_DELAY_S = 0.1
 DEFAULT_INTERVAL = 0
 # Seconds after a write in which late or repeated answers to it may arrive.
 LATE_ANSWER_S = 3.0
-# ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
+# ArduPilot handles parameters periodically, and answers this many reads each time.
 MAX_READS_AT_DEFAULT_RATE = 5
-# Reading a few parameters raises ArduPilot's rate of answers after this many seconds. By then, the vehicle probably
-# lacks a parameter, whose request must be repeated.
+# A read that is unanswered after this many seconds probably asks for a parameter that the vehicle lacks. The request is
+# then repeated several times, so that a higher rate of answers is worth its cost.
 RAISE_DELAY_S = 0.5
 # Fewer changes than this are set one by one. A file would not be faster, and the vehicle confirms each value.
 MIN_CHANGES_FOR_FILE = 10
@@ -232,7 +232,7 @@ class ParameterAccess:
         )
         if len(names) > MAX_READS_AT_DEFAULT_RATE:
             raise_after_s: float | None = 0.0
-        elif probe:  # A missing parameter is requested several times.
+        elif probe:
             raise_after_s = RAISE_DELAY_S
         else:
             raise_after_s = None
@@ -327,17 +327,19 @@ class ParameterAccess:
             # Answers to a write that was cancelled or failed may also arrive late.
             self._written_at.update(dict.fromkeys(names, transfers.connection.now()))
         for name, answer in answers.items():
-            if not isinstance(answer, Parameter):
-                continue
-            self.written[name] = answer.value
-            # A late answer with the previous value must not replace the new one in the store.
-            if name in old_values and answer.value != old_values[name]:
-                self.store.set_stale(name, old_values[name])
-            stored = self.store.get(name)
-            if stored is not None and not same_value(stored.value, answer.value):
-                # Another value arrived after the answer. It may be a late answer, so the parameter is read again.
-                self._read_later(name, transfers.connection.now() + STALE_VALUE_S)
+            if isinstance(answer, Parameter):
+                self._on_confirmed(name, answer.value, old_values.get(name))
         return answers
+
+    def _on_confirmed(self, name: str, value: float, old_value: float | None) -> None:
+        self.written[name] = value
+        # A late answer with the previous value must not replace the new one in the store.
+        if old_value is not None and value != old_value:
+            self.store.set_stale(name, old_value)
+        stored = self.store.get(name)
+        if stored is not None and not same_value(stored.value, value):
+            # Another value arrived after the confirmation. It may be a late answer, so the parameter is read again.
+            self._read_later(name, self._transfers.connection.now() + STALE_VALUE_S)
 
     def is_in_doubt(self, name: str) -> bool:
         """Return True if the known value may be outdated.

@@ -63,8 +63,7 @@ class Parameters(ReadOnly):
         session.at_close(self._access.store.attach())
         session.on_reboot.append(self._access.forget)
         self._names = NameResolver(self._access)
-        # Set by `load_metadata`.
-        self._metadata: Metadata | None = None
+        self._metadata: Metadata | None = None  # set by `load_metadata`
         self._writer = ParameterWriter(self._access, self._names, self._note_of)
         self._registry = RestoreRegistry()
 

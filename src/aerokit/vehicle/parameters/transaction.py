@@ -39,13 +39,13 @@ class RestoreRegistry:
         self._blocks: dict[str, list[_Block]] = {}
         self._lock = asyncio.Lock()
         self.restored: dict[str, Parameter] = {}
-        """Parameters that other blocks have restored since the last block began to save values."""
+        """Parameters that were restored since a block last began to save values."""
 
     @asynccontextmanager
     async def exclusive(self, timeout: float | None = None) -> AsyncIterator[None]:
-        """Wait until no other block saves or restores values, at most ``timeout`` seconds.
+        """Wait, at most ``timeout`` seconds, until no other block saves or restores values.
 
-        A block that begins while another one restores its parameters would save, and later restore, temporary values.
+        A block that saves a value while another block restores it would save, and later restore, a temporary value.
         """
         with anyio.move_on_after(timeout) as waiting:
             await self._lock.acquire()
@@ -107,7 +107,7 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # If another block did not wait for this one, the answer may be its temporary value.
+            # The answer may be a temporary value if another block did not wait and restored its parameters meanwhile.
             current[name] = self._registry.restored.get(name) or self._with_all_bits(answer)
             if name not in self._saved:
                 self._saved[name] = current[name]
@@ -154,7 +154,7 @@ class _Block:
         answers: Mapping[str, object] = {}
         reason = ""
         began_at = anyio.current_time()
-        # Another block may wait long for an answer. That must not prevent this one from restoring its values.
+        # If another block waits long for an answer, restore the values of this block without waiting for it.
         async with self._registry.exclusive(self._idle_timeout_s):
             saved = self._take_saved()
             self._registry.restored.update({param.name: param for param in saved})
@@ -164,9 +164,9 @@ class _Block:
                 try:
                     names = [param.name for param in saved if self._access.written.get(param.name) is not None]
                     present = await self._access.read(names, self._idle_timeout_s)
-                    # Keep values that another station has set. Parameters that cannot be read count as not restored.
                     saved = [param for param in saved if not self._was_changed(param.name, present.get(param.name))]
-                    to_write = [param for param in saved if isinstance(present.get(param.name, param), Parameter)]
+                    unreadable = {name for name, answer in present.items() if not isinstance(answer, Parameter)}
+                    to_write = [param for param in saved if param.name not in unreadable]
                     answers = await self._access.write(to_write, self._idle_timeout_s)
                 except AerokitError as error:
                     reason = f" ({error})"
