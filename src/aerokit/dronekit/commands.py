@@ -21,7 +21,7 @@ from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission
 from aerokit.missions.item import MissionItem, canonical_frame
-from aerokit.missions.wire import convert_from_ardupilot, from_degrees, shift_jumps, to_wire_float, unscaled_xy
+from aerokit.missions.wire import convert_from_ardupilot, scaled_coordinate, shift_jumps, to_wire_float, unscaled_xy
 from aerokit.sync.thread_future import when_done
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.values import LocationGlobal
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-# The fields of MAVLink 1, in the order of a command's text. DroneKit has no `mission_type`, which MAVLink 2 added.
+# Fields of MISSION_ITEM in MAVLink 1. DroneKit does not show `mission_type`, which MAVLink 2 added.
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
 PARAM_FIELDS: list[str] = FIELDS[7:11]
 # Fields to compare with the vehicle's mission.
@@ -105,7 +105,7 @@ class Command(_MissionItem):
     ) -> None:
         numbers = (param1, param2, param3, param4, x, y, z)
         super().__init__(target_system, target_component, seq, frame, command, current, autocontinue, *numbers)
-        self._fieldnames = FIELDS  # without `mission_type`, which DroneKit's text of a command does not show
+        self._fieldnames = FIELDS  # fields in str(command)
 
 
 class SequenceState(Snapshot):
@@ -416,7 +416,7 @@ def _item_of(cmd: Command, index: int) -> MissionItem:
 
 def _wire_number(value: Any, command: int, frame: int) -> int | float:
     """Convert x or y for MISSION_ITEM_INT."""
-    number = from_degrees(float(value), command, frame)
+    number = scaled_coordinate(float(value), command, frame)
     # Like ArduPilot, drop the fraction of parameters 5 and 6.
     # Infinity and numbers that are much too large stay floats, which the check of the plan refuses.
     return int(number) if isinstance(number, float) and abs(number) < 1e9 else number

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Literal, overload
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavMountMode, MavVtolState
-from aerokit.missions.item import action_item, in_range, place_item, whole_number
+from aerokit.missions.item import Altitudes, action_item, in_range, place_item, whole_number
 
 if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.position import Home, Position
 
-# With a delay of 0, ArduPilot waits until a time of day.
+# ArduPilot takes a NAV_DELAY of 0 seconds for a delay until a time of day.
 _MIN_DELAY_S = 0.001
 
 _MAX_DURATION_S = 86_400.0 * 365
@@ -289,7 +289,7 @@ def region_of_interest(
         MavCmd.DO_SET_ROI_LOCATION,
         latitude_deg,
         longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        Altitudes(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         is_needed=True,
     )
 

@@ -1,14 +1,7 @@
 """Comparison of items that tolerates the changes made by the protocol and by the vehicle's storage.
 
 The tables describe how the firmware converts the numbers of an item (ArduPilot 4.7 AP_Mission, PX4 1.17
-mavlink_mission), and were verified on vehicles. A string has one letter for each of the seven numbers of an item. A
-number without a letter, or with ``-``, is not stored, and is read back as 0. The other letters are:
-
-- ``f`` unchanged; ``h`` 16-bit float; ``2`` always 2; ``?`` 1 if above 0, else 0; ``g`` 1 or -1, the sign;
-- ``u`` ``b`` unsigned integer of 16 or 8 bits; ``s`` ``i`` signed integer of 16 or 8 bits; ``U`` 16 bits that wrap;
-- ``c`` integer, clipped to 255; ``n`` like ``c``, but a fraction below 1 is stored in steps of 1/256;
-- ``r`` whole metres with sign; ``R`` like ``r`` in 8 bits, above 255 m in tens of metres; ``k`` whole centimetres;
-- ``y`` heading, normalised to 0 to 360.
+mavlink_mission), and were verified on vehicles.
 """
 
 from __future__ import annotations
@@ -50,7 +43,7 @@ class ItemStorage(Enum):
 
 
 # How an autopilot stores the parameters of each command: one letter for each of `FIELDS`, explained in `_stored_as`.
-# Fields without a letter are not stored, except those of a place.
+# Fields without a letter are not stored and are read back as 0, except those of a place.
 _ARDUPILOT_FORMS: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # The first string is for Copter, Rover and Sub, the second for Plane.
     MavCmd.NAV_LOITER_UNLIM: ("--r",),

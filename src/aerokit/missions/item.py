@@ -6,7 +6,7 @@ https://mavlink.io/en/services/mission.html and https://mavlink.io/en/messages/c
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from aerokit._internal.formatting import short_repr
 from aerokit._internal.geo import check_place
@@ -245,7 +245,13 @@ class MissionItem(Snapshot):
 
 MAX_ALTITUDE_M = 83_000.0  # ArduPilot's LOCATION_ALT_MAX_M
 
-Altitudes = tuple["float | None", "float | None", "float | None"]
+
+class Altitudes(NamedTuple):
+    """The altitude arguments of a place: above home, above mean sea level, above the terrain."""
+
+    relative_m: float | None = None
+    amsl_m: float | None = None
+    terrain_m: float | None = None
 
 
 def place_item(
@@ -258,8 +264,8 @@ def place_item(
 ) -> MissionItem:
     """Create an item at a place. Without a place, x and y are 0, which ArduPilot takes for the current position.
 
-    Exactly one of the three ``altitudes`` must be given (above home, above mean sea level, above the terrain), unless
-    the place is a Position with an altitude. With ``is_needed``, a missing place raises InvalidArgument.
+    Exactly one of the ``altitudes`` must be given, unless the place is a Position with an altitude. With ``is_needed``,
+    a missing place raises InvalidArgument.
     """
     if isinstance(latitude_deg, (Position, Home)):
         if longitude_deg is not None:
@@ -269,7 +275,7 @@ def place_item(
             )
         position = travel_target(latitude_deg)
         latitude_deg, longitude_deg = position.latitude_deg, position.longitude_deg
-        if altitudes == (None, None, None):
+        if altitudes == Altitudes():
             altitudes = _altitudes_of(position)
     if isinstance(longitude_deg, (Position, Home)):
         raise InvalidArgument(
@@ -277,7 +283,7 @@ def place_item(
             f" {latitude_deg!r}, was taken for the latitude. Pass the place as the first argument, and the altitude by"
             " name: (place, altitude_relative_m=…)"
         )
-    z, frame = altitude_and_frame(*altitudes)
+    z, frame = altitude_and_frame(altitudes)
     if latitude_deg is None and longitude_deg is None and not is_needed:
         return MissionItem(command, frame, *_four(parameters), z=z)
     if latitude_deg is None or longitude_deg is None:
@@ -293,18 +299,16 @@ def place_item(
 def _altitudes_of(position: Position) -> Altitudes:
     # Like go_to, prefer the altitude above home.
     if position.altitude_relative_m is not None:
-        return position.altitude_relative_m, None, None
-    return None, position.altitude_amsl_m, None
+        return Altitudes(relative_m=position.altitude_relative_m)
+    return Altitudes(amsl_m=position.altitude_amsl_m)
 
 
-def altitude_and_frame(
-    relative_m: float | None, amsl_m: float | None, terrain_m: float | None
-) -> tuple[float, MavFrame]:
+def altitude_and_frame(altitudes: Altitudes) -> tuple[float, MavFrame]:
     """Return the altitude that is given and its frame. Exactly one altitude must be given."""
     candidates = (
-        ("altitude_relative_m", relative_m, MavFrame.GLOBAL_RELATIVE_ALT),
-        ("altitude_amsl_m", amsl_m, MavFrame.GLOBAL),
-        ("altitude_terrain_m", terrain_m, MavFrame.GLOBAL_TERRAIN_ALT),
+        ("altitude_relative_m", altitudes.relative_m, MavFrame.GLOBAL_RELATIVE_ALT),
+        ("altitude_amsl_m", altitudes.amsl_m, MavFrame.GLOBAL),
+        ("altitude_terrain_m", altitudes.terrain_m, MavFrame.GLOBAL_TERRAIN_ALT),
     )
     given_altitudes = [(name, value, frame) for name, value, frame in candidates if value is not None]
     if len(given_altitudes) != 1:

@@ -15,10 +15,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, overload
 
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions.item import action_item, heading, in_range, place_item, whole_number
+from aerokit.missions.item import Altitudes, action_item, heading, in_range, place_item, whole_number
 
 if TYPE_CHECKING:
-    from aerokit.missions.item import Altitudes, MissionItem
+    from aerokit.missions.item import MissionItem
     from aerokit.position import Home, Position
 
 _MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
@@ -78,7 +78,7 @@ def waypoint(
         MavCmd.NAV_WAYPOINT,
         latitude_deg,
         longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        Altitudes(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("hold_s", hold_s, 0, _MAX_DURATION_S),
         in_range("acceptance_radius_m", acceptance_radius_m, 0, _MAX_METRES),
         in_range("pass_by_m", pass_by_m, -_MAX_METRES, _MAX_METRES),
@@ -124,7 +124,7 @@ def spline_waypoint(
         MavCmd.NAV_SPLINE_WAYPOINT,
         latitude_deg,
         longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        Altitudes(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("hold_s", hold_s, 0, _MAX_DURATION_S),
         is_needed=True,
     )
@@ -180,7 +180,7 @@ def take_off(
     """
     return place_item(
         MavCmd.NAV_TAKEOFF,
-        *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
+        *_place_or_altitude(latitude_deg, longitude_deg, altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("pitch_deg", pitch_deg, 0, 90),
         _UNSET,
         _UNSET,
@@ -230,7 +230,7 @@ def vtol_take_off(
     """
     return place_item(
         MavCmd.NAV_VTOL_TAKEOFF,
-        *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
+        *_place_or_altitude(latitude_deg, longitude_deg, altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         _UNSET,
         _UNSET,
         _UNSET,
@@ -381,7 +381,7 @@ def loiter_unlimited(
         MavCmd.NAV_LOITER_UNLIM,
         latitude_deg,
         longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        Altitudes(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         _UNSET,
         _UNSET,
         in_range("radius_m", radius_m, -_MAX_METRES, _MAX_METRES),
@@ -433,7 +433,7 @@ def loiter_time(
         MavCmd.NAV_LOITER_TIME,
         latitude_deg,
         longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        Altitudes(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("duration_s", duration_s, 0, _MAX_DURATION_S),
         _UNSET,
         in_range("radius_m", radius_m, -_MAX_METRES, _MAX_METRES),
@@ -485,7 +485,7 @@ def loiter_turns(
         MavCmd.NAV_LOITER_TURNS,
         latitude_deg,
         longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        Altitudes(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("turns", turns, 0, 255),
         _UNSET,
         in_range("radius_m", radius_m, -2550, 2550),
@@ -541,7 +541,7 @@ def loiter_to_altitude(
     """
     return place_item(
         MavCmd.NAV_LOITER_TO_ALT,
-        *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
+        *_place_or_altitude(latitude_deg, longitude_deg, altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         _UNSET,
         in_range("radius_m", radius_m, -_MAX_METRES, _MAX_METRES),
         _UNSET,
@@ -587,22 +587,23 @@ def rally_point(
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_RALLY_POINT
     """
-    altitudes = (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)
+    altitudes = Altitudes(altitude_relative_m, altitude_amsl_m, altitude_terrain_m)
     item = place_item(MavCmd.NAV_RALLY_POINT, latitude_deg, longitude_deg, altitudes, is_needed=True)
     in_range("altitude", item.z, -32_768, 32_767)
     return item
 
 
 def _place_or_altitude(
-    latitude_deg: Position | Home | float | None, longitude_deg: float | None, altitudes: Altitudes
+    latitude_deg: Position | Home | float | None, longitude_deg: float | None, *altitudes: float | None
 ) -> tuple[Position | Home | float | None, float | None, Altitudes]:
-    """Treat a number without a longitude as an altitude above home."""
-    if isinstance(latitude_deg, (int, float)) and longitude_deg is None and altitudes == (None, None, None):
-        return None, None, (latitude_deg, None, None)
-    return latitude_deg, longitude_deg, altitudes
+    """Return latitude, longitude and altitudes. A number without a longitude is an altitude above home."""
+    given = Altitudes(*altitudes)
+    if isinstance(latitude_deg, (int, float)) and longitude_deg is None and given == Altitudes():
+        return None, None, Altitudes(relative_m=latitude_deg)
+    return latitude_deg, longitude_deg, given
 
 
 def _altitudes_or_home(relative_m: float | None, amsl_m: float | None, terrain_m: float | None) -> Altitudes:
     """Return the altitude of the ground at a landing place. Without one, it is that of home."""
-    altitudes = (relative_m, amsl_m, terrain_m)
-    return (0.0, None, None) if altitudes == (None, None, None) else altitudes
+    altitudes = Altitudes(relative_m, amsl_m, terrain_m)
+    return Altitudes(relative_m=0.0) if altitudes == Altitudes() else altitudes

@@ -16,12 +16,12 @@ import copy
 import json
 import math
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.errors import FileFormatError
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import DEGREE_SCALE, MissionItem, canonical_frame, has_place, xy_scale
-from aerokit.missions.wire import from_degrees, unscaled_xy
+from aerokit.missions.wire import scaled_coordinate, unscaled_xy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -95,19 +95,23 @@ _MODE_OF_FRAME: dict[int, int] = {
 }
 
 
-def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
+class _Entry(NamedTuple):
+    """An entry of ``mission.items``: simple items in the file, or the items generated for a landing pattern."""
+
+    value: JsonValue
+    simple_items: Sequence[JsonValue] = ()
+    landing_items: tuple[MissionItem, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return len(self.simple_items) + len(self.landing_items)
+
+
+def read_entries(values: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
     """Return the items of each entry of ``mission.items``. Jumps have the index of their target among all items."""
-    groups = [_simple_values(entry) for entry in entries]  # None for a landing pattern, whose items are generated
-    landings = {number: landing_items(entries[number]) for number, group in enumerate(groups) if group is None}
-    sizes = [len(landings[number]) if group is None else len(group) for number, group in enumerate(groups)]
-    ids = _jump_ids(entries, groups, sizes)
-    items: list[tuple[MissionItem, ...]] = []
-    for number, group in enumerate(groups):
-        if group is None:
-            items.append(landings[number])
-        else:
-            items.append(tuple(_read_item(value, ids) for value in group))
-    return items
+    entries = list(map(_read_entry, values))
+    ids = _jump_ids(entries)
+    return [entry.landing_items or tuple(_read_item(item, ids) for item in entry.simple_items) for entry in entries]
 
 
 def merged_entries(
@@ -168,15 +172,14 @@ def json_number(value: float) -> int | float | None:
     return int(value) if is_whole and abs(value) < 2**53 else value  # Beyond 2**53, not every integer is a float.
 
 
-def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
-    """Return the simple items in an entry; None for a landing pattern."""
+def _read_entry(entry: JsonValue) -> _Entry:
     kind = entry["type"]
     kind.one_of("SimpleItem", "ComplexItem")
     if kind.value == "SimpleItem":
-        return [entry]
+        return _Entry(entry, [entry])
     complex_type = entry["complexItemType"].value
     if isinstance(complex_type, str) and complex_type in LANDING_PATTERNS:
-        return None
+        return _Entry(entry, landing_items=landing_items(entry))
     body = entry.child("TransectStyleComplexItem")
     items = body.child("Items") if body is not None else None
     if items is None or not items.elements():
@@ -184,30 +187,24 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
             f"a complex item with TransectStyleComplexItem.Items; this is a {complex_type!r}, for which the file has"
             " only settings and no items"
         )
-    return items.elements()
+    return _Entry(entry, items.elements())
 
 
-def _jump_ids(
-    entries: Sequence[JsonValue], groups: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
-) -> dict[int, int]:
-    """Map each doJumpId in a .plan file to the index of the mission item that has this id.
-
-    The three arguments describe the same entries: ``groups`` are their simple items (None for a landing pattern), and
-    ``sizes`` their numbers of mission items.
-    """
+def _jump_ids(entries: Sequence[_Entry]) -> dict[int, int]:
+    """Map each doJumpId in a .plan file to the index of the mission item that has this id."""
     ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
     first = 0
-    for entry, group, size in zip(entries, groups, sizes):  # noqa: B905 - same length
-        for index, value in enumerate(group or (), first):
+    for entry in entries:
+        for index, value in enumerate(entry.simple_items, first):
             member = value.child("doJumpId")
             jump_id = index + 1 if member is None else member.integer(-1, 2**31)
-            has_own_entry = value is entry
+            has_own_entry = value is entry.value
             if has_own_entry:
                 ids_of_entries.setdefault(jump_id, index)
             else:
                 ids_in_surveys.setdefault(jump_id, index)
-        first += size
+        first += entry.size
     # If two items have the same id, an item with an entry of its own is preferred to one inside a survey.
     return ids_in_surveys | ids_of_entries
 
@@ -225,7 +222,7 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
         param1 = _jump_target(first_param, ids)
     if math.isnan(z) and has_place(command):  # The file has no altitude in `params`.
         frame, z = _planned_altitude(value, frame)
-    x, y = (from_degrees(number, command, frame) for number in (latitude, longitude))
+    x, y = (scaled_coordinate(number, command, frame) for number in (latitude, longitude))
     return MissionItem(command, frame, param1, param2, param3, param4, x, y, z, value["autoContinue"].boolean())
 
 

@@ -17,7 +17,7 @@ from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import DEGREE_SCALE, DESTINATIONS, MissionItem, canonical_frame, xy_scale
 from aerokit.missions.mission import Mission
-from aerokit.missions.wire import from_degrees, shift_jumps, unscaled_xy
+from aerokit.missions.wire import scaled_coordinate, shift_jumps, unscaled_xy
 from aerokit.position import Position
 
 if TYPE_CHECKING:
@@ -137,8 +137,8 @@ class _Row:
             self._number("param2", may_be_nan=True),
             self._number("param3", may_be_nan=True),
             self._number("param4", may_be_nan=True),
-            x=from_degrees(latitude, self.command, self.frame),
-            y=from_degrees(longitude, self.command, self.frame),
+            x=scaled_coordinate(latitude, self.command, self.frame),
+            y=scaled_coordinate(longitude, self.command, self.frame),
             z=self._number("altitude", may_be_nan=True),
             autocontinue=bool(self._integer("autocontinue", 0xFF)),
         )

@@ -86,7 +86,7 @@ def from_wire(message: messages.MissionItemInt | messages.MissionItem) -> Missio
     x: int | float = message.x
     y: int | float = message.y
     if isinstance(message, messages.MissionItem):
-        x, y = (from_degrees(value, message.command, message.frame) for value in (x, y))
+        x, y = (scaled_coordinate(value, message.command, message.frame) for value in (x, y))
     return MissionItem(
         message.command,
         message.frame,
@@ -108,10 +108,10 @@ def unscaled_xy(item: MissionItem) -> tuple[float, float]:
     return x, y
 
 
-def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Return the ``x`` or ``y`` of an item for degrees, for metres in a local frame, or for an unscaled parameter.
+def scaled_coordinate(value: float, command: int, frame: int) -> int | float:
+    """Convert degrees (in a global frame), metres (in a local frame) or a parameter to the ``x`` or ``y`` of an item.
 
-    This is the inverse of :func:`unscaled_xy`. Degrees and metres are rounded to an integer.
+    Infinity and a parameter with a fraction are returned unchanged. This is the inverse of :func:`unscaled_xy`.
     """
     if math.isnan(value):
         return DEFAULT_XY

@@ -202,7 +202,7 @@ class FileChannel:
         )
 
     def _possible_sessions(self, request: FtpRequest) -> tuple[int, ...]:
-        """Return the ids of the sessions that an unanswered request may have opened."""
+        """Return the ids that an unanswered request may have opened: its own, or 0 if the vehicle chooses the id."""
         return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:

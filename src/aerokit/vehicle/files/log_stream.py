@@ -182,7 +182,7 @@ class LogStream(ReadOnly):
         """
         connection = self._context.session.connection
         started_at = connection.now()
-        while True:  # Messages that are not used do not extend the time.
+        while True:  # Messages that add nothing to the log do not extend the time-out.
             idle_since = max(started_at, self._assembler.received_at)
             message = await self._messages.get(max(0.0, idle_since + self._idle_timeout_s - connection.now()))
             is_for_us = message.target_system in (0, connection.source_system)

@@ -216,8 +216,8 @@ class MissionTracker:
         self._last_item_current_at = -math.inf
         # True if the vehicle flies to the item in `reached` once more.
         self._is_approached_again = False
-        # True once the vehicle has flown the mission, until the mission ends.
-        self._was_active = False
+        # True from the first report that the vehicle flies the mission until the mission ends.
+        self._has_begun = False
         # A report of completion before this time may be about the previous flight.
         self.stale_until: float = -math.inf
         telemetry = session.telemetry
@@ -250,12 +250,12 @@ class MissionTracker:
 
     def start(self) -> None:
         """Begin to track a new flight of the mission."""
-        self._was_active = False
+        self._has_begun = False
         self._reached_since_start = None
         self.discard_completion()
 
     def discard_completion(self) -> None:
-        if not self._was_active:
+        if not self._has_begun:
             self.is_complete = False
             # Reports of completion before this time are about the previous flight.
             self.stale_until = self._session.connection.now() + STALE_STATE_S
@@ -265,7 +265,7 @@ class MissionTracker:
             cell.forget()
         self.reached = self._reached_since_start = None
         self.is_complete = False
-        self._was_active = False
+        self._has_begun = False
 
     def close(self, error: Exception) -> None:
         for cell in (self.current, self.count, self.progress):
@@ -305,7 +305,7 @@ class MissionTracker:
         if state != MissionState.COMPLETE:
             self.stale_until = -math.inf
             if state == MissionState.ACTIVE and self.is_in_mission_mode and self._session.telemetry.is_armed:
-                self._was_active = True
+                self._has_begun = True
                 self.is_complete = False
         elif self._session.connection.now() >= self.stale_until:
             self._complete()
@@ -313,10 +313,10 @@ class MissionTracker:
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
         # A vehicle that disarms on its way to a last waypoint has not flown the mission: it may have hit a slope.
         may_be_complete = self.is_last_item_reached or self._may_end_by_landing()
-        was_at_end = self._was_active and self.is_at_last_item and self.is_in_mission_mode
+        was_at_end = self._has_begun and self.is_at_last_item and self.is_in_mission_mode
         if not is_armed and was_at_end and may_be_complete:
             self._complete()
-        elif not is_armed and not self._was_active and self._session.connection.now() < self.stale_until:
+        elif not is_armed and not self._has_begun and self._session.connection.now() < self.stale_until:
             self.stale_until = math.inf  # This flight has not begun, so it cannot be complete.
 
     def _on_reached(self, _: int | None, seq: int) -> None:
@@ -335,8 +335,8 @@ class MissionTracker:
 
     def _complete(self) -> None:
         self.is_complete = True
-        if self._was_active:
-            self._was_active = False
+        if self._has_begun:
+            self._has_begun = False
             self._session.publish(MissionFinished)
 
     @property

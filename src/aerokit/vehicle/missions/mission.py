@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
+# Seconds to wait for MISSION_CURRENT to report the end of the mission. It is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 
 # On a bad link, several MISSION_CURRENTs may be lost. The mission counts as interrupted if the next one does not report
@@ -96,7 +96,7 @@ class MissionEndDetector:
         # Until this time, HEARTBEAT may still report the mode before the mission.
         self._mode_grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
-        self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
+        self._interrupted_at: float | None = None  # when the vehicle was first seen disarmed, or in another mode
         self.ground: GroundCheck = GroundCheck(session)
 
     def has_ended(self) -> bool:
@@ -131,8 +131,10 @@ class MissionEndDetector:
             return completes_at_home or self._has_returned() or self._is_on_ground
         if self._lands_or_returns:
             return self._is_on_ground
-        # Known items do not end by a landing or a return here. Unknown items may, which the mode shows a little later.
-        return self._ending is Ending.OTHER or self._is_on_ground or self._has_stayed_complete()
+        if self._ending is Ending.OTHER:
+            return True
+        # The items are unknown. If they end with a landing or a return, the mode shows it a little later.
+        return self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
         """Return True if the mission, which is complete now, has been complete for ``END_GRACE_S``."""
@@ -170,21 +172,25 @@ class MissionEndDetector:
         is_mode_settling = now < self._vehicle_context.arbiter.mode_settles_at
         is_mode_expected = is_paused or is_in_mode or self._is_landing or is_mode_settling
         if is_mode_expected and not session.telemetry.is_confirmed_disarmed:
-            self._left_at = None
+            self._interrupted_at = None
             return None
-        # The mode also changes at the end of the mission, which may be reported a little later than the mode. Another
-        # mode is therefore a failure only after END_GRACE_S and a MISSION_CURRENT.
-        if self._left_at is None:
-            self._left_at = now
-        has_report = self._tracker.progress.updated_at > max(self._left_at, self._tracker.stale_until)
-        timeout_s = END_GRACE_S if has_report else END_REPORT_TIMEOUT_S
-        if now - self._left_at < timeout_s or now < self._mode_grace_until:
+        if not self._is_interruption_final():
             return None
         if session.telemetry.is_confirmed_disarmed:
             return f"the mission has not ended ({self.describe()}), but the vehicle is disarmed"
         if self._was_in_mode:
             return f"the mode changed to {session.telemetry.mode_name}, {self.describe()}"
         return f"the vehicle is not flying its mission but is in {session.telemetry.mode_name}"
+
+    def _is_interruption_final(self) -> bool:
+        # The mode also changes at the end of the mission, which may be reported a little later than the mode. Another
+        # mode is therefore a failure only after END_GRACE_S and a MISSION_CURRENT.
+        now = self._session.connection.now()
+        if self._interrupted_at is None:
+            self._interrupted_at = now
+        has_report = self._tracker.progress.updated_at > max(self._interrupted_at, self._tracker.stale_until)
+        timeout_s = END_GRACE_S if has_report else END_REPORT_TIMEOUT_S
+        return now - self._interrupted_at >= timeout_s and now >= self._mode_grace_until
 
     def describe(self) -> str:
         current, count = self._tracker.current.latest, self._tracker.count.latest
@@ -235,8 +241,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._vehicle_context = context.vehicle_context
         self._session = context.session
         self._tracker = context.tracker
-        # The last order that was given by a method of this object.
-        self._order: Order | None = None
+        self._order: Order | None = None  # the last order that was given by a method of this object
         self._is_paused = False
 
     @property
@@ -404,7 +409,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 stall_reason=MissionStallDetector(session, self._tracker, mode, items, self._is_held_by_pause),
-                at_positions=False,  # The next poll is soon enough, and a mission may take hours.
+                at_positions=False,  # Checks at each position would cost much in a mission of hours.
             )
 
     def _is_held_by_pause(self) -> bool:
@@ -515,7 +520,7 @@ class MissionControl(VehiclePlan["Mission"]):
         return self._tracker.is_complete and end_text is not None and any(end_text in text for text in texts)
 
     def _refusals(self, order: Order) -> tuple[str, ...]:
-        """Return PX4's texts since the order that there is no mission to fly. PX4 has then left the mode again."""
+        """Return PX4's status texts, sent after the order, that it left the mode because it has no mission to fly."""
         refusal = self._session.autopilot.no_mission_text
         texts = self._session.texts_since(order.given_at)
         return tuple(text for text in texts if refusal is not None and refusal in text)
