@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import re
 import runpy
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,6 +41,12 @@ def test_modules_have_docstrings(name: str) -> None:
 def test_public_names_have_docstrings(name: str) -> None:
     missing = list(without_docstring(importlib.import_module(name)))
     assert not missing, f"without docstring: {', '.join(missing)}"
+
+
+def test_references_in_docstrings_exist() -> None:
+    sources = "".join(path.read_text("utf-8") for path in Path(aerokit.__file__).parent.rglob("*.py"))
+    for target in set(re.findall(r":(?:class|func|meth|attr|mod):`(?:[^`<]*<)?~?(aerokit[\w.]*)", sources)):
+        pkgutil.resolve_name(target)
 
 
 def without_docstring(module: ModuleType) -> Iterator[str]:

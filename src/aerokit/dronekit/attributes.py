@@ -222,7 +222,7 @@ class VehicleAttributes(VehicleCore):
             return False
         aio = self._dk.aio_or_none
         if aio is not None and aio.autopilot.prearm_depends_on_mode:
-            # On PX4, a bit of SYS_STATUS has the result of the checks for the current mode; there is no EKF report.
+            # PX4 sends no EKF_STATUS_REPORT, but the result of its pre-arm checks in SYS_STATUS.
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         # Like DroneKit, require any fix (2D or better) and a predicted position of the estimator.

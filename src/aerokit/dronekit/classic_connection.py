@@ -31,7 +31,7 @@ vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
 CLOSE_TIMEOUT_S = 2.0  # maximum time that close() waits for the answers to recent orders
 
-# A new call replaces the previous call of its kind. "disarm" and "arm" share one kind, so they replace each other.
+# A disarming call has the kind "arm", because calls replace the previous call of their kind.
 SHARED_KINDS = {"disarm": "arm"}
 
 CoroutineFunction = Callable[..., Awaitable[object]]
@@ -51,7 +51,7 @@ class ClassicConnection:
         self.target_system = target_system
         """System id of the vehicle, 0 until it is found."""
         self.listener_thread: ListenerThread = ListenerThread()
-        self.listener_thread.on_called = loop.activity.feed  # Our HEARTBEAT stops without such activity.
+        self.listener_thread.on_called = loop.activity.feed  # Our HEARTBEAT stops when the program shows no activity.
         self.loop = loop
         self._context = context  # the context manager of `open_connection`; close() exits it
         self.connection: Connection = context.value

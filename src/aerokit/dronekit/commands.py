@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 # Fields of MISSION_ITEM in MAVLink 1. DroneKit does not show `mission_type`, which MAVLink 2 added.
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
-PARAM_FIELDS: list[str] = FIELDS[7:11]
+PARAM_FIELDS = ("param1", "param2", "param3", "param4")
 # Fields to compare with the vehicle's mission.
-CONTENT_FIELDS: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
+CONTENT_FIELDS = ("frame", "command", "autocontinue", *PARAM_FIELDS, "x", "y", "z")
 AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
-# The first row of a waypoint file counts as home if it is this close to home; 1e-4 degrees are about ten metres.
+# A first waypoint this close to home is taken for the home row of a waypoint file. 1e-4 degrees are about ten metres.
 HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # Attributes that `wait_ready(True)` waits for.
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 
-WAIT_STEP_S = 0.2  # Ctrl-C and a lost link end a wait after this time.
+WAIT_STEP_S = 0.2  # Ctrl-C and a lost link end a wait within this time.
 SILENCE_WARNING_S = 5
 TICK_INTERVAL_S = 0.05
 IDLE_TICK_INTERVAL_S = 1.0
@@ -100,7 +100,7 @@ class LatestMessage(Generic[MessageT]):
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
         self._notified_names: set[str] = set()  # attributes whose listeners the handlers notify
-        self._needs_every_message = False  # True if a handler does more than notify these listeners
+        self._needs_every_message = False  # True if a handler does more than notify listeners
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
         self._decoded: MessageT | None = None  # cache of the property `message`; may be older than `_latest`

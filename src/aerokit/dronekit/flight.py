@@ -138,8 +138,8 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # If this order overrules another one, HEARTBEAT may report the wanted state before either order has had
-                # an effect. In this case, `order` must be done, too.
+                # While an opposite order is unfinished, HEARTBEAT may report the wanted state only because that order
+                # has had no effect yet. `order` must then be done, too.
                 return self._dk_reports_armed(value) and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)

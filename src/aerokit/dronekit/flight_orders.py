@@ -89,7 +89,7 @@ def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
     """Return the vehicle's autopilot; ArduPilot for autopilots whose mode numbers are unknown."""
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
-    # pymavlink, too, uses ArduPilot's mode numbers for autopilots such as iNav.
+    # Like pymavlink, use ArduPilot's mode numbers for autopilots such as iNav.
     heartbeat = m.Heartbeat(
         vehicle.vehicle_type,
         MavAutopilot.ARDUPILOTMEGA,
@@ -215,7 +215,7 @@ class CurrentCommand:
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        # Index of the item that was set as current on PX4, until the vehicle reports another item.
+        # Index of the item that the program has set on PX4; None once PX4 reports another item.
         self._requested_index: int | None = None
         self._latest = core.on(m.MissionCurrent, self._on_current)
 
@@ -253,11 +253,10 @@ class CurrentCommand:
             await aio.mission.set_current(max(seq - 1, 0))
             self._requested_index = seq - 1  # -1 is not the index of an item.
             return
-        # DroneKit, too, sends this message only once.
-        aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
+        aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))  # once, as in DroneKit
         current, sent_at = aio.telemetry.mission_current, aio.connection.now()
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
-            # A value from before the sending confirms nothing, even if it has this number.
+            # An earlier report of this number confirms nothing.
             await current.wait_until(lambda progress: progress.current == seq and current.updated_at > sent_at)
             return
         # MISSION_SET_CURRENT was not confirmed in time, so send a command instead, which the vehicle acknowledges.

@@ -32,7 +32,7 @@ MAX_MESSAGES = 1000
 MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
 # Messages are stored from the first access to `Master.messages` on. A look-up this soon after it waits for the message.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
-SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
+SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait within this time.
 
 
 class Master:

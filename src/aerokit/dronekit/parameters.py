@@ -119,7 +119,7 @@ class ParameterDownload:
             return False  # A vehicle that is sending the list may ignore requests, so the parameter may exist.
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
-        # Only a rejection with a code is an answer of the vehicle.
+        # A rejection without a code means that the vehicle ignored the request.
         return all(isinstance(answer, ParameterRejected) and answer.code is not None for answer in answers)
 
 
@@ -230,7 +230,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     """Maps names to values: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
     Names are converted to upper case; values are floats. Old and new names of parameters that ArduPilot renamed both
-    work; values are converted, and a warning is logged.
+    work; values are converted, and a :class:`aerokit.parameters.ParameterRenamedWarning` is issued.
 
     All parameters are downloaded in the background after connecting, but not again after a reboot or a lost link.
     Changes that the vehicle reports are included. Reading a missing value requests only that value; iterating waits for

@@ -368,8 +368,8 @@ def connect(
     Args:
         ip: connection string: ``'127.0.0.1:14550'`` and ``'udp:…'`` listen, ``'tcp:127.0.0.1:5760'``,
             ``'/dev/ttyACM0'``, ``'com14'`` … (docs/addresses.md).
-        wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a list waits for the
-            names in it. With any other value, ``connect`` does not wait.
+        wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a name or a list of
+            names waits for these attributes. With None or False, ``connect`` does not wait.
         timeout: seconds for ``wait_ready``.
         still_waiting_callback: called with the set of missing names.
         still_waiting_interval: seconds between these calls.

@@ -54,7 +54,7 @@ class UlogAssembler:
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
         """Add a message of the stream, and return the bytes to append to the file."""
         gap = 0 if self._next_sequence is None else (message.sequence - self._next_sequence) % SEQUENCE_RANGE
-        if gap >= SEQUENCE_RANGE // 2:  # PX4 repeats a message if our acknowledgement was lost.
+        if gap >= SEQUENCE_RANGE // 2:  # An old message, which PX4 repeats if our acknowledgement was lost.
             return b""
         data = bytes(message.data[: message.length])
         prefix = b""  # the header of the file, or a ULog message that marks a gap
@@ -146,7 +146,7 @@ class LogStream(ReadOnly):
     def _stop_soon(self) -> None:
         session = self._context.session
         if session.is_open:
-            # Send the command now, because the vehicle's block may end before the background task runs.
+            # Send the command now, because `async with connect()` may end before the background task runs.
             session.commands.send_unconfirmed(MavCmd.LOGGING_STOP)
             session.transfers.command_in_background(MavCmd.LOGGING_STOP, was_just_sent=True)
 

@@ -210,7 +210,7 @@ class MissionTracker:
         self._reached_since_start: int | None = None
         # True if the last mission was flown to its end.
         self.is_complete: bool = False
-        # Time at which `reached` was reached.
+        # Time of the report that changed `reached`.
         self._reached_at = -math.inf
         # Time of the last report that the last item is the current one.
         self._last_item_current_at = -math.inf

@@ -87,7 +87,7 @@ class MissionEndDetector:
             self._ending = Ending.LANDING
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
         self._return_began_at: float | None = None  # when `_has_returned` was first called
-        # Modes in which the vehicle may land: only that of the last item if this is a landing or a return.
+        # Modes in which the vehicle may land. If the last item is a landing or a return, only the mode of this item.
         self._landing_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for command, purpose in LANDING_PURPOSES.items()
@@ -452,7 +452,7 @@ class MissionControl(VehiclePlan["Mission"]):
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
-            # The number 0 is home. ArduPilot then begins with the first item, and also resets its jump counts.
+            # With 0, which is home, ArduPilot begins with the first item and also resets its jump counts.
             number = 0 if item == 0 and not keeps_jump_counts else seq
             try:
                 await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)

@@ -33,13 +33,12 @@ CacheChoice = bool | str | os.PathLike[str]
 
 # Seconds and attempts without an answer after which MAVFTP counts as unsupported, even if the vehicle advertises it.
 FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS = 2.0, 3
-ANSWER_DELAY_S = 0.1
+# ArduPilot handles parameters every ANSWER_DELAY_S, and answers this many reads each time.
+ANSWER_DELAY_S, MAX_READS_AT_DEFAULT_RATE = 0.1, 5
 # Value of SET_MESSAGE_INTERVAL that restores the autopilot's default rate.
 DEFAULT_INTERVAL = 0
 # Seconds after a write in which late or repeated answers to it may arrive.
 LATE_ANSWER_S = 3.0
-# ArduPilot handles parameters periodically, and answers this many reads each time.
-MAX_READS_AT_DEFAULT_RATE = 5
 # A read that is unanswered after this many seconds probably asks for a parameter that the vehicle lacks. The request is
 # then repeated several times, so that a higher rate of answers is worth its cost.
 RAISE_DELAY_S = 0.5
@@ -69,7 +68,6 @@ class ParameterAccess:
     def _read_round_trip(self) -> RoundTrip:
         if self._cached_read_round_trip is None:
             link_s = self._transfers.round_trip.smoothed_s
-            # This is longer than the link's round trip, because ArduPilot answers at most five reads every 0.1 s.
             self._cached_read_round_trip = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
         return self._cached_read_round_trip
 

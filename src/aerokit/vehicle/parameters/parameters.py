@@ -47,7 +47,7 @@ class Parameters(ReadOnly):
 
     ArduPilot 4.7 renamed parameters and changed their units (``WPNAV_SPEED`` in cm/s became ``WP_SPD`` in m/s). Every
     method accepts the old and the new name with either firmware, and converts the value. An old name that the vehicle
-    no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning`, which contains the new name.
+    no longer has causes an :class:`aerokit.parameters.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
     while it reads more than five parameters, and restores the rate at the end. For unknown names, which the vehicle may

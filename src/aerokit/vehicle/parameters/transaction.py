@@ -33,7 +33,7 @@ MAX_RESTORE_TIMEOUTS = 3
 
 
 class RestoreRegistry:
-    """Maps each parameter to the open blocks that will restore it, in the order in which they first wrote it."""
+    """Maps each parameter to the open `async with` blocks that will restore it, in the order of their first writes."""
 
     def __init__(self) -> None:
         self._blocks: dict[str, list[_Block]] = {}
@@ -119,8 +119,8 @@ class _Block:
 
     def _with_all_bits(self, answer: Parameter) -> Parameter:
         """Return the stored parameter if it equals the answer, which may lack the last bits of a number."""
-        # Otherwise the store is out of date: another station has just undone our write, and the store has ignored the
-        # message about this (`set_stale`).
+        # If they differ, another station has just undone our write, and the store has ignored the message about this
+        # (`set_stale`).
         known = self._access.store.get(answer.name)
         return known if known is not None and same_value(float(known.value), float(answer.value)) else answer
 
@@ -158,7 +158,7 @@ class _Block:
         async with self._registry.exclusive(self._idle_timeout_s):
             saved = self._take_saved()
             self._registry.restored.update({param.name: param for param in saved})
-            # If the event loop was blocked, the wait was longer, but there must be time left to restore the values.
+            # A blocked event loop may have lengthened the wait. This must not use up the time to restore the values.
             waited_s = min(anyio.current_time() - began_at, self._idle_timeout_s)
             with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s - waited_s):
                 try:
