@@ -1,4 +1,4 @@
-"""The attributes of a vehicle and of its location, which messages update, and the notification of their listeners."""
+"""Attributes of a vehicle and of its location. Messages update the attributes, and notify their listeners."""
 
 from __future__ import annotations
 
@@ -106,9 +106,8 @@ def _position_of(message: m.GlobalPositionInt) -> tuple[float | None, float | No
 class VehicleAttributes(VehicleCore):
     """DroneKit's attributes of a vehicle.
 
-    Reading an attribute returns the latest value without waiting, on any thread.
-
-    Each message is stored by a single assignment, so that the values within one attribute are from the same message.
+    Reading an attribute returns the latest value without waiting, on any thread. The numbers in one attribute, such as
+    pitch, yaw and roll, are from the same message.
     """
 
     _dk_heartbeat: m.Heartbeat | None = None

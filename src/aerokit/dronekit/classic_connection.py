@@ -77,8 +77,9 @@ class ClassicConnection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message without blocking, from any thread.
 
-        Messages are sent in the order of the calls. ``to`` is as in :meth:`Connection.send`. Raises InvalidArgument
-        if a field is out of range, and APIException if the connection is closed.
+        Messages are sent in the order of the calls. With ``to``, the message goes to the system with this id, instead
+        of that in its ``target_system``. Raises InvalidArgument if a field is out of range, and APIException if the
+        connection is closed.
         """
         message.encode()  # Raises for an invalid field here. On the loop, the error would only be logged.
         with classic_errors():

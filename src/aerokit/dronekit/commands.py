@@ -1,6 +1,6 @@
 """``vehicle.commands``: the mission of a vehicle in the classic API, and its ``Command`` items.
 
-Indices are ArduPilot's for every vehicle: item 0 is home, and ``commands[0]`` has ``seq`` 1. Items of a
+The ``seq`` of a command is ArduPilot's for every vehicle: home has 0, and ``commands[0]`` has 1. Items of a
 :class:`aerokit.missions.Mission` count from 0 without home, so jump targets differ by one.
 """
 

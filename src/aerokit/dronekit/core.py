@@ -200,10 +200,9 @@ class Core:
         return aio
 
     def check_may_wait(self) -> None:
-        """Raise APIException if the link is down, or on the loop's thread."""
+        """Raise APIException if the link is down, or on the loop's thread, where a wait would be a deadlock."""
         self.check_link()
         with classic_errors():
-            # On the loop's thread, a wait would be a deadlock.
             self.handler.loop.check_may_wait()
 
     # ----------------------------------------------------------------------------- receiving

@@ -82,7 +82,7 @@ class Gimbal(GimbalPrivates):
         self._core.order("gimbal", gimbal.point, pitch, yaw, roll_deg=roll, wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
-        """Point the camera at a location; a copter without a gimbal turns itself. Zeros end the pointing."""
+        """Point the camera, or a copter without a gimbal, at a location. A location of zeros ends this order."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_all_zeros = not any(checked_location(roi))

@@ -256,7 +256,7 @@ class Master:
 class Inbox(Mapping[str, Any]):
     """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    Messages are stored from the first access on. A look-up in the first second waits until the message arrives.
+    Messages are stored from the first access on. A look-up within one second of this access waits for the message.
     Messages of radios and ground stations are included, but not those of other vehicles.
     """
 

@@ -79,8 +79,7 @@ class Listeners:
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
         """Call the listeners of a name with a value, on the listener thread.
 
-        With ``waits``, wait for them as :meth:`ListenerThread.call` does. With ``cache``, call them only if the value
-        has changed.
+        With ``waits``, wait for them, at most two seconds. With ``cache``, call them only if the value has changed.
         """
         if cache:
             if name in self.last_values and self.last_values[name] == value:

@@ -1,7 +1,7 @@
 """Values of vehicle attributes, with DroneKit's names and texts.
 
-Values are plain objects with writable attributes. Unknown numbers are None. They are typed ``float | Any``, so that
-type checkers do not require a check for None. Locations compare by identity.
+Values are plain objects with writable attributes. Unknown numbers are None. Attributes are typed ``float | Any``, so
+that type checkers do not require a check for None. Locations compare by identity.
 """
 
 from __future__ import annotations

@@ -177,7 +177,7 @@ def _stored_as(letter: str, value: float) -> Iterator[float]:
 
 
 def _finite_stored_as(letter: str, value: float) -> Iterator[float]:
-    """Like `_stored_as`, for the other letters and a finite value."""
+    """Like `_stored_as`, for a finite value that is not stored as an integer with a range."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float, whose maximum is 3.4e38
         if abs(value) <= 3.4028234663852886e38:

@@ -604,6 +604,6 @@ def _place_or_altitude(
 
 
 def _altitudes_or_home(relative_m: float | None, amsl_m: float | None, terrain_m: float | None) -> Altitudes:
-    """Return the altitude of the ground at a landing place. Without one, it is that of home."""
+    """Return the altitudes of a landing. If none is given, the ground is as high as home."""
     altitudes = Altitudes(relative_m, amsl_m, terrain_m)
     return Altitudes(relative_m=0.0) if altitudes == Altitudes() else altitudes

@@ -122,7 +122,7 @@ class _Row:
         return self.command in (0, MavCmd.NAV_WAYPOINT) and canonical_frame(self.frame) == MavFrame.GLOBAL
 
     def home(self) -> Position | None:
-        """Return None for 0°, 0°. Files have this place if home is unknown."""
+        """Return the place of home, or None for 0°, 0°, which files contain if home is unknown."""
         latitude, longitude = self._number("latitude", 90), self._number("longitude", 180)
         return Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None
 

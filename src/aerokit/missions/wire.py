@@ -1,4 +1,4 @@
-"""Converts items to messages and packed plans, and item indices of programs to item indices of vehicles; and back."""
+"""Conversions of items: to messages, to packed plans, to the item numbers of the vehicle; and back."""
 
 from __future__ import annotations
 

@@ -371,7 +371,6 @@ class _Reader:
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:
-        """Return the camera's definition. The caller has checked that the file can be parsed."""
         root, head = self._root, self._root.find("definition")
         settings: dict[str, SettingDefinition] = {}
         for node in root.iterfind("parameters/parameter"):

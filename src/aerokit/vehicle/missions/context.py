@@ -108,7 +108,7 @@ class PlanContext:
         self.tracker: MissionTracker = MissionTracker(session, self._may_end_by_landing)
 
     def _may_end_by_landing(self) -> bool:
-        """Return False if the last item of the mission is known, and is neither a landing nor a return."""
+        """Return True if the last item of the mission is a landing or a return, or is unknown."""
         items = self.caches[MavMissionType.MISSION].items
         return not items or items[-1].command in LANDING_PURPOSES
 

@@ -107,7 +107,7 @@ class MissionEndDetector:
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
-        """Return True if the vehicle reports the end of the mission. It may do so after a crash."""
+        """Return True if the vehicle reports the end of the mission. A crashed vehicle may report it, too."""
         if self._tracker.is_complete:
             return self._is_completion_final()
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.

@@ -144,7 +144,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
     async def _transfer(
         self, idle_timeout_s: float, timeout: float | None, on_progress: OnProgress | None
     ) -> AsyncIterator[PlanTransfer[PlanT]]:
-        """Yield a transfer during the block. Waits for transfers of the vehicle's other plans."""
+        """Wait until transfers of the vehicle's other plans have ended, then yield a new transfer."""
         from aerokit.vehicle.missions.transfer import PlanTransfer
 
         context = self._context

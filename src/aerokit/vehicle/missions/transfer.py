@@ -305,7 +305,7 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Transfer no files from now on, or raise the error."""
+        """Raise the error, or use the mission protocol instead of files from now on."""
         # If files have worked before, only a FileError ends their use.
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
