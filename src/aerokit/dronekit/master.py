@@ -43,9 +43,8 @@ class Master:
 
     def __init__(self, connection: ClassicConnection) -> None:
         self._connection = connection
-        own_ids = connection.connection
-        self.source_system: int = own_ids.source_system
-        self.source_component: int = own_ids.source_component
+        self.source_system: int = connection.connection.source_system
+        self.source_component: int = connection.connection.source_component
         """Component id of this program."""
         self.mav: MessageFactory = MessageFactory(self._send, self.source_system, self.source_component)
         """Object with a method for each message, which creates and sends it."""

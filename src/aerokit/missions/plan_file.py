@@ -74,7 +74,7 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
         Mission() if mission is None else _read_mission(mission),
         Fence() if fence is None else _read_fence(fence),
         RallyPoints() if rally is None else _read_rally(rally),
-        *_read_numbers(mission),
+        **_read_numbers(mission),
         source=text,
     )
 
@@ -190,18 +190,15 @@ def _read_mission(value: JsonValue) -> Mission:
     return Mission(items, None if home is None else _read_place(home, altitude="amsl"))
 
 
-def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
-    defaults = _numbers(Plan())
-    default_firmware, default_vehicle, default_cruise, default_hover = defaults
-    if mission is None:
-        return defaults
-    firmware, vehicle, cruise, hover = (mission.child(key) for key in _NUMBER_KEYS.values())
-    return (
-        default_firmware if firmware is None else firmware.integer(0, 0xFF),
-        default_vehicle if vehicle is None else vehicle.integer(0, 0xFF),
-        default_cruise if cruise is None else cruise.number(),
-        default_hover if hover is None else hover.number(),
-    )
+def _read_numbers(mission: JsonValue | None) -> dict[str, Any]:
+    """Return the fields of `Plan` for the numbers that the mission in the file has."""
+    numbers: dict[str, Any] = {}
+    for field, key in _NUMBER_KEYS.items():
+        value = None if mission is None else mission.child(key)
+        if value is not None:
+            is_type = field in ("firmware_type", "vehicle_type")
+            numbers[field] = value.integer(0, 0xFF) if is_type else value.number()
+    return numbers
 
 
 def _read_fence(value: JsonValue) -> Fence:

@@ -315,7 +315,7 @@ class PlanTransfer(Generic[PlanT]):
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
-        if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
+        if (result.is_confirmed and not verify) or await self._is_verified_by_checksum(items):
             return
         try:
             await self._verify(items, method)
@@ -351,10 +351,8 @@ class PlanTransfer(Generic[PlanT]):
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._mission_type, self._cache.updated_at)
-            checksum = mission_checksum(items)
             # Another station may have just replaced the plan. The next report must therefore have the same checksum.
-            if reported == checksum and await self._context.wait_for_plan_id(self._mission_type, checksum):
-                self._cache.set(items, self._context.now(), checksum)
+            if reported == mission_checksum(items) and await self._reports_checksum_of(items):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
@@ -403,21 +401,23 @@ class PlanTransfer(Generic[PlanT]):
         parts = list(_consecutive_ranges(changed_seqs))
         return not parts or len(changed_seqs) + PART_OVERHEAD_ITEMS * len(parts) < count
 
-    async def _receives_checksum_of(self, items: Sequence[MissionItem]) -> bool:
+    async def _is_verified_by_checksum(self, items: Sequence[MissionItem]) -> bool:
         """Return True if the vehicle reports the checksum of these items.
 
-        Does not wait for it if reading the items back is faster.
+        Does not wait for the report if reading the items back is faster.
         """
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
         reading_takes_s = len(items) / autopilot.mission_download_window * round_trip_s
-        if not autopilot.reports_mission_checksum or reading_takes_s < CHECKSUM_INTERVAL_S:
-            return False
+        is_checksum_faster = autopilot.reports_mission_checksum and reading_takes_s >= CHECKSUM_INTERVAL_S
+        return is_checksum_faster and await self._reports_checksum_of(items)
+
+    async def _reports_checksum_of(self, items: Sequence[MissionItem]) -> bool:
         checksum = mission_checksum(items)
-        if not await self._context.wait_for_plan_id(self._mission_type, checksum):
-            return False  # The checksum did not arrive in time.
-        self._cache.set(items, self._context.now(), checksum)
-        return True
+        is_reported = await self._context.wait_for_plan_id(self._mission_type, checksum)
+        if is_reported:
+            self._cache.set(items, self._context.now(), checksum)
+        return is_reported
 
     async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
         self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
