@@ -222,7 +222,8 @@ class CommandSequence:
         added = _command_from(cmd)
         added.target_system = self._core.target_system
         cmd.target_system = added.target_system
-        if self._append(added) == 0:
+        is_home = self._append(added)
+        if is_home:
             self._core.logger.info("the first command is home, as in a waypoint file: %s", added)
 
     @property
@@ -269,17 +270,18 @@ class CommandSequence:
         unknown_home = _commands_of(Mission(), (0, 0))  # only the home row, with zeros
         return (*unknown_home, *state.items)
 
-    def _append(self, cmd: Command) -> int:
-        """Append a command, or store it as home. Return its ``seq``, which is 0 for home."""
+    def _append(self, cmd: Command) -> bool:
+        """Append a command, or store it as home. Return True if it is home."""
         with self._lock:
             state = self._state
-            if not state.items and _is_home_row(cmd, self._vehicle._home_location):
+            is_home = not state.items and _is_home_row(cmd, self._vehicle._home_location)
+            if is_home:
                 cmd.seq = 0
                 self._state = state.replace(home=cmd, is_changed=True)
             else:
                 cmd.seq = len(state.items) + 1
                 self._state = state.replace(items=(*state.items, cmd), is_changed=True)
-            return cmd.seq
+            return is_home
 
     async def _run_download(self, number: int) -> None:
         try:
