@@ -206,7 +206,7 @@ def test_definition_accepts_value(name: str, value: object, sent: object) -> Non
         ("CAM_QUALITY", 5, r"10\.\.100"),
         ("CAM_QUALITY", 50.5, "a whole number"),
         ("CAM_STAMP", 2, "True or False"),
-        ("CAM_OWNER", 5, "a text or bytes"),
+        ("CAM_OWNER", 5, "text or bytes"),
         ("CAM_OWNER", "x" * 129, "at most 128"),
         ("CAM_OWNER", b"\0", "zeros at its end"),
         ("CAM_LENS", "new", "can only be read"),

@@ -45,9 +45,7 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
         except OverflowError:
             raise InvalidArgument(f"{value!r} cannot be sent: it is too large for a 32-bit float") from None
     if type not in _FORMATS:
-        raise InvalidArgument(
-            f"{value!r} cannot be sent: an {type.name} has eight bytes, but the message has room for four"
-        )
+        raise InvalidArgument(f"{value!r} cannot be sent: {type.name} has eight bytes, but the message holds four")
     return _FORMATS[type].pack(value).ljust(4, b"\0")
 
 

@@ -239,7 +239,7 @@ def _rows(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> Iterator
 
 def _code_of(parameter: Parameter) -> int:
     if parameter.type not in _CODE_BY_TYPE:
-        raise InvalidArgument(f"{parameter.name} is an {parameter.type.name}, which param.pck cannot store")
+        raise InvalidArgument(f"{parameter.name} has the type {parameter.type.name}, which param.pck cannot store")
     return _CODE_BY_TYPE[parameter.type]
 
 

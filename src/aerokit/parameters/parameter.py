@@ -241,7 +241,7 @@ def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noq
             raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be a number")
         return checked_value(name, value, ParameterType(type))  # type: ignore[arg-type]  # checked there
     if not isinstance(value, (str, bytes, bytearray)):
-        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be a text or bytes")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be text or bytes")
     try:
         data = value.encode() if isinstance(value, str) else bytes(value)
     except UnicodeEncodeError:

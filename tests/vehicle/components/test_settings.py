@@ -132,7 +132,7 @@ async def test_invalid_names_and_values_are_refused() -> None:
             ("CAM_WBMODE", 1.5, "a whole number"),
             ("CAM_WBMODE", -1, r"CAM_WBMODE = -1 must be in 0\.\.4294967295"),
             ("CAM_WBMODE", "Sunny", "a number"),
-            ("CAM_OWNER", 7, "a text or bytes"),
+            ("CAM_OWNER", 7, "text or bytes"),
         ):
             with pytest.raises(InvalidArgument, match=complaint):
                 await settings.set(name, value)
