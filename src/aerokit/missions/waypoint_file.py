@@ -61,20 +61,25 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     """Parse the text of a ``QGC WPL`` file. Error texts begin with ``name``."""
     numbered_lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     numbered_lines = [(number, line) for number, line in numbered_lines if line and not line.startswith("#")]
-    first_number, first_line = numbered_lines[0] if numbered_lines else (1, "")
-    *file_type, version = first_line.split() or [""]
-    if file_type != ["QGC", "WPL"] or version not in ("110", "120"):
-        found = repr(first_line[:40]) if first_line else "no text"
-        raise FileFormatError(f"{name}: line {first_number}: expected 'QGC WPL 110' or 'QGC WPL 120', found {found}")
+    header_number, header = numbered_lines[0] if numbered_lines else (1, "")
+    version = _version_in(header, f"{name}: line {header_number}")
     rows = [
         _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(numbered_lines[1:])
     ]
-    may_begin_with_home = version == "110"
-    if not rows or not may_begin_with_home or not rows[0].is_home():
+    has_home = version == "110" and bool(rows) and rows[0].is_home()
+    if not has_home:
         return Mission([row.item() for row in rows])
     # In the file, jump targets count home as an item, unlike in `Mission`.
     home = rows[0].home()
     return Mission(shift_jumps([row.item() for row in rows[1:]], -1), home)
+
+
+def _version_in(header: str, where: str) -> str:
+    *file_type, version = header.split() or [""]
+    if file_type != ["QGC", "WPL"] or version not in ("110", "120"):
+        found = repr(header[:40]) if header else "no text"
+        raise FileFormatError(f"{where}: expected 'QGC WPL 110' or 'QGC WPL 120', found {found}")
+    return version
 
 
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:

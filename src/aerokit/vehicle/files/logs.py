@@ -251,28 +251,31 @@ class Logs:
     async def _locate(
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> _LocatedLog:
-        known = log if isinstance(log, LogEntry) else None
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
-        if known is not None and not prefers_messages:
-            path = await self._path(known, idle_timeout_s)
-            if path is not None:
-                return _LocatedLog(known, path)
+        if not prefers_messages and (located := await self._locate_file(log, idle_timeout_s)) is not None:
+            return located
         try:
             # With "auto", another method may work, so give up early.
             max_unanswered = MAX_UNANSWERED_REQUESTS if method == "auto" else None
             entry = await self._entry(log, idle_timeout_s, timeout, max_unanswered)
         except FileTimeout:
             # ArduPilot does not answer LOG_* messages while it is armed. MAVFTP can read a log whose entry is known.
-            path = None if known is None or method != "auto" else await self._path(known, idle_timeout_s)
-            if known is None or path is None:
+            located = await self._locate_file(log, idle_timeout_s) if method == "auto" else None
+            if located is None:
                 raise
-            return _LocatedLog(known, path)
+            return located
         if prefers_messages:
             return _LocatedLog(entry, path=None)
         path = await self._path(entry, idle_timeout_s)
         if path is None and method == "ftp":
             raise _no_such_log(entry.id, "its file on the vehicle cannot be identified")
         return _LocatedLog(entry, path)
+
+    async def _locate_file(self, log: LogEntry | int, idle_timeout_s: float) -> _LocatedLog | None:
+        if isinstance(log, int):  # The file is identified by its size, which is not known yet.
+            return None
+        path = await self._path(log, idle_timeout_s)
+        return None if path is None else _LocatedLog(log, path)
 
     async def _path(self, entry: LogEntry, idle_timeout_s: float) -> str | None:
         """Return the path of a log for MAVFTP, or None if MAVFTP cannot be used for it."""
