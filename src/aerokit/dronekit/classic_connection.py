@@ -31,7 +31,7 @@ vehicle_logger: logging.Logger = logging.getLogger("dronekit")
 
 CLOSE_TIMEOUT_S = 2.0  # maximum time that close() waits for the answers to recent orders
 
-# A disarming call has the kind "arm", because calls replace the previous call of their kind.
+# Disarming counts as a call of the kind "arm", so that arming and disarming replace each other.
 SHARED_KINDS = {"disarm": "arm"}
 
 CoroutineFunction = Callable[..., Awaitable[object]]

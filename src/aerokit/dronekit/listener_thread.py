@@ -47,7 +47,7 @@ class ListenerThread:
             self._calls.put((function, args))
 
     def post_or_drop(self, function: Callable[..., object], *args: Any) -> None:
-        """Like :meth:`post`, but drop the call while the queue is full. For values that soon get a newer one."""
+        """Like :meth:`post`, but drop the call while the queue is full. For values that are soon replaced."""
         if self._calls.qsize() < MAX_QUEUED_CALLS:
             self.post(function, *args)
             return

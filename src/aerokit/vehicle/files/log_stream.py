@@ -146,7 +146,7 @@ class LogStream(ReadOnly):
     def _stop_soon(self) -> None:
         session = self._context.session
         if session.is_open:
-            # Send the command now, because `async with connect()` may end before the background task runs.
+            # Send the command now, because the connection may close before the background task runs.
             session.commands.send_unconfirmed(MavCmd.LOGGING_STOP)
             session.transfers.command_in_background(MavCmd.LOGGING_STOP, was_just_sent=True)
 
