@@ -84,6 +84,11 @@ async def _post_mode(stage: Stage, posted: str = "LOITER") -> None:
         await order.set_mode(mode, timeout=2)
 
 
+def _post_newer(stage: Stage) -> None:
+    with stage.vehicle.posted("mode"), stage.vehicle.posted("arm", armed=False):
+        pass
+
+
 def _deny_arming(stage: Stage) -> None:
     own = stage.vehicle.connection.source_component
     stage.simulated.send(messages.CommandAck(400, 2, 0, 0, 255, own))
@@ -163,6 +168,9 @@ def _actions() -> Table:
         ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, stops_sending, alone=True),
         ("Vehicle.set_mode", "InvalidArgument"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "InvalidArgument"): P(_method("set_heading", 999), airborne),
+        ("Vehicle.set_home", "OperationRejected"): later(
+            _method("set_home"), pilot, 0.3, before=ignored(Cmd.DO_SET_HOME)
+        ),
         ("Vehicle.set_home", "OperationTimeout"): P(
             _method("set_home", timeout=1),
             before=lambda s: [accepted(command)(s) for command in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
@@ -189,6 +197,12 @@ def _actions() -> Table:
         ("PostedOrder.set_mode", "OperationTimeout"): P(_post_mode, grounded, accepted(Cmd.DO_SET_MODE)),
         ("PostedOrder.wait_confirmed", "OperationTimeout"): P(
             lambda s: _post(s, ["arm"], armed=True), grounded, accepted(arm)
+        ),
+        ("PostedOrder.set_mode", "OperationRejected"): later(
+            _post_mode, _post_newer, 0.5, grounded, before=accepted(Cmd.DO_SET_MODE)
+        ),
+        ("PostedOrder.wait_confirmed", "OperationRejected"): later(
+            lambda s: _post(s, ["arm"], armed=True), _post_newer, 0.5, grounded, before=accepted(arm)
         ),
         ("PostedOrder.wait_confirmed", "CommandRejected"): later(
             lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)

@@ -1407,6 +1407,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
                 sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: the order has ended: it was superseded or taken over.
             OperationTimeout: the vehicle accepted the mode but stayed in another mode.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
@@ -1416,6 +1417,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
         Raises:
             CommandRejected: the vehicle first accepted and then refused the command, as PX4 may do.
+            OperationRejected: a newer order was given about the same subject.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         self._loop.run(self.aio.wait_confirmed, timeout)
@@ -5021,6 +5023,8 @@ class Vehicle(VehicleTwin):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer call of `set_home` replaced this one, or a pilot or a failsafe took over before
+                the acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HOME_POSITION did not report the new home.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from functools import partial
 from typing import Any
@@ -902,6 +903,21 @@ async def test_set_home_reports_home_that_stays(flying: Flight, monkeypatch: pyt
     place = home.position.offset(north_m=30.0).replace(altitude_amsl_m=home.altitude_amsl_m)
     with pytest.raises(OperationTimeout, match=r"^set_home: not reached within 5 s; home is Home"):
         await flying.vehicle.set_home(place)
+
+
+async def test_set_home_replaced_by_newer_one_is_rejected(flying: Flight) -> None:
+    copter, home = flying.copter, flying.vehicle.home.value
+    place = home.position.replace(altitude_amsl_m=home.altitude_amsl_m)
+    copter.faults.refuse(MavCmd.REQUEST_MESSAGE)
+    copter.faults.lose(m.HomePosition)
+    first = asyncio.ensure_future(flying.vehicle.set_home(place.offset(north_m=30.0)))
+    await anyio.sleep(0.5)
+    second = asyncio.ensure_future(flying.vehicle.set_home(place.offset(north_m=60.0)))
+    await anyio.sleep(0.5)
+    copter.send_built(m.HomePosition.ID)
+    await second
+    with pytest.raises(OperationRejected, match=r"^set_home: another order was given"):
+        await first
 
 
 async def test_look_at_refused(flying: Flight) -> None:

@@ -371,6 +371,19 @@ async def test_posted_mode_before_flight_is_no_takeover() -> None:
 
 
 @pytest.mark.anyio
+async def test_accepted_order_ends_when_newer_one_is_posted(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    loiter, guided = map(vehicle.autopilot.find_mode, ("LOITER", "GUIDED"))
+    grounded.copter.faults.refuse(SET_MODE, MavResult.ACCEPTED, times=1)
+    with vehicle.posted("mode", modes=(loiter,)) as order:
+        await order.command(SET_MODE, *vehicle.autopilot.mode_order(loiter).params)
+        with vehicle.posted("mode", modes=(guided,)) as newer_order:
+            await newer_order.set_mode(guided)
+            with pytest.raises(OperationRejected, match=r"^posted order: another order was given"):
+                await order.wait_confirmed(5)
+
+
+@pytest.mark.anyio
 async def test_posted_order_errors_say_why(grounded: Flight) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     faults.refuse(ARM, MavResult.FAILED, "PreArm: Compass not healthy")

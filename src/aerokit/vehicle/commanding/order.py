@@ -25,6 +25,8 @@ Topic: TypeAlias = Hashable
 
 ROI: Topic = "region of interest"
 """Topic of orders that point the autopilot's gimbal, or the nose, at a place."""
+HOME: Topic = "home position"
+"""Topic of orders that move the home position."""
 
 SUPERSEDED = "another order was given"
 """Reason for the end of an order that a newer order replaced."""

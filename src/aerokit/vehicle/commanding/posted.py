@@ -11,6 +11,7 @@ from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandRejected, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import command_name
+from aerokit.vehicle.commanding.order import SUPERSEDED
 from aerokit.vehicle.commanding.progress import ChangeSignal
 
 if TYPE_CHECKING:
@@ -111,6 +112,7 @@ class PostedOrder:
                 sent.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: the order has ended: it was superseded or taken over.
             OperationTimeout: the vehicle accepted the mode but stayed in another mode.
         """
         if mode not in self._order.modes:
@@ -150,6 +152,7 @@ class PostedOrder:
 
         Raises:
             CommandRejected: the vehicle first accepted and then refused the command, as PX4 may do.
+            OperationRejected: a newer order was given about the same subject.
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         await self._sender.await_effect(
@@ -157,7 +160,7 @@ class PostedOrder:
             self._order,
             self._refusals,
             is_done=self._is_done,
-            failure_reason=lambda: None,
+            failure_reason=lambda: SUPERSEDED if self._arbiter.is_replaced(self._order) else None,
             timeout=timeout,
             max_silence_s=None,
         )

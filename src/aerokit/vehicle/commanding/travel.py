@@ -30,7 +30,7 @@ from aerokit.mavlink.enums import (
 from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
 from aerokit.position import Home, Position, position_with_altitude, travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
-from aerokit.vehicle.commanding.order import ROI
+from aerokit.vehicle.commanding.order import HOME, ROI, SUPERSEDED
 from aerokit.vehicle.commanding.progress import (
     MAX_DISTANCE_M,
     MAX_SILENCE_S,
@@ -362,14 +362,16 @@ class TravelActions(VehicleBase):
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
+            OperationRejected: a newer call of `set_home` replaced this one, or a pilot or a failsafe took over before
+                the acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HOME_POSITION did not report the new home.
         """
         if place is not None and place.altitude_amsl_m is None:
             raise InvalidArgument(
                 "place.altitude_amsl_m = None is not allowed: home needs an altitude above mean sea level"
             )
-        home = self.telemetry.home
-        with self._arbiter.auxiliary_order() as order:
+        home, home_order = self.telemetry.home, self._arbiter.device_order(HOME)
+        with self._arbiter.auxiliary_order(home_order) as order:
             if place is None:
                 await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1 means the present position.
             else:
@@ -389,10 +391,14 @@ class TravelActions(VehicleBase):
         # Most vehicles send HOME_POSITION once when their home has moved, and this message may be lost.
         task = self._session.background.start(self._request_home, "aerokit request of the home position")
         try:
-            await home.wait_until(is_set, timeout=timeout, description="set_home")
+            reported = await home.wait_until(
+                lambda reported: is_set(reported) or not home_order.is_newest, timeout=timeout, description="set_home"
+            )
         finally:
             if task is not None:
                 task.cancel()
+        if not is_set(reported):
+            raise OperationRejected(f"set_home: {SUPERSEDED}")
 
     async def _request_home(self) -> None:
         with suppress(AerokitError):
