@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from aerokit import messages as m
 from aerokit.connection.multilink.duplicates import Copies
 from aerokit.connection.multilink.link_choice import MIN_CLOCK_MATCHES, PROBED_TIMEOUT_S, LinkChoice
-from aerokit.connection.multilink.vehicle_clock import HardwareId, VehicleClock
+from aerokit.connection.multilink.vehicle_clock import ClockSample, HardwareId, VehicleClock
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 
@@ -64,7 +64,7 @@ def test_unproven_link_is_never_used(
             candidate.record_counts(received, 1, now)
         elif what == "answer":
             boot_s = now + 350.0 if link == 2 else max(0.0, now - begin)
-            choice.record_answer(link, now - round_trip / 2, boot_s, round_trip, now)
+            choice.record_answer(link, ClockSample(now - round_trip / 2, boot_s, round_trip), now)
         elif what == "hardware":
             choice.record_hardware(link, HardwareId(b"A" * 18, 0))
         elif what == "pause":
@@ -101,9 +101,9 @@ def test_clock_continues_at_any_speed(speed: float, begin: float, round_trips: l
         now += 0.5
         boot_s = begin + speed * (now - round_trip / 2 + (round_trip / 2) * 0.2 * (-1) ** index)
         at = now - round_trip / 2
-        assert clock.matches(at, boot_s, round_trip) is not False
-        assert not clock.matches(at, boot_s + 60.0 * max(1.0, speed), round_trip)
-        assert clock.add(at, boot_s, round_trip)
+        assert clock.matches(ClockSample(at, boot_s, round_trip)) is not False
+        assert not clock.matches(ClockSample(at, boot_s + 60.0 * max(1.0, speed), round_trip))
+        assert clock.add(ClockSample(at, boot_s, round_trip))
 
 
 def test_reboot_resets_proof_until_clock_matches_again() -> None:
@@ -113,26 +113,26 @@ def test_reboot_resets_proof_until_clock_matches_again() -> None:
     choice.choose(0.0)
     for step in range(MIN_CLOCK_MATCHES + 1):
         for link in (0, 1):
-            choice.record_answer(link, step, step + 70.0, 0.01, step)
+            choice.record_answer(link, ClockSample(step, step + 70.0, 0.01), step)
     second = choice.candidates[1]
     proofs = [second.is_same_vehicle]
-    choice.record_answer(0, 5.0, 1.0, 0.01, 5.0)
+    choice.record_answer(0, ClockSample(5.0, 1.0, 0.01), 5.0)
     assert [*proofs, second.is_same_vehicle] == [True, None]
-    choice.record_answer(0, 6.0, 2.0, 0.01, 6.0)
+    choice.record_answer(0, ClockSample(6.0, 2.0, 0.01), 6.0)
     for step in range(MIN_CLOCK_MATCHES):
-        choice.record_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
+        choice.record_answer(1, ClockSample(6.0 + step, 2.0 + step, 0.01), 6.0 + step)
     assert choice.candidates[1].is_same_vehicle
 
 
 def test_paused_clock_continues_at_the_same_speed() -> None:
     clock = VehicleClock()
     for step in range(10):
-        assert clock.add(step, 70.0 + step, 0.01)
-    assert clock.add(11.5, 79.0 + 1.0, 0.01), "it stood still for 1.5 s"
-    assert clock.matches(12.5, 81.0, 0.01)
-    assert not clock.matches(12.5, 82.5, 0.01)
-    assert not clock.add(13.0, 3.0, 0.01), "it has rebooted"
-    assert clock.matches(14.0, 4.0, 0.01)
+        assert clock.add(ClockSample(step, 70.0 + step, 0.01))
+    assert clock.add(ClockSample(11.5, 79.0 + 1.0, 0.01)), "it stood still for 1.5 s"
+    assert clock.matches(ClockSample(12.5, 81.0, 0.01))
+    assert not clock.matches(ClockSample(12.5, 82.5, 0.01))
+    assert not clock.add(ClockSample(13.0, 3.0, 0.01)), "it has rebooted"
+    assert clock.matches(ClockSample(14.0, 4.0, 0.01))
 
 
 @given(st.floats(0.2, 20.0), st.floats(0.2, 20.0))
@@ -140,8 +140,8 @@ def test_changed_clock_speed_is_measured_again(before: float, after: float) -> N
     clock, boot_s = VehicleClock(), 0.0
     for step in range(40):
         boot_s += 0.5 * (before if step < 10 else after)
-        clock.add(step / 2, boot_s, 0.01)
-    assert clock.matches(21.0, boot_s + 1.5 * after, 0.01)
+        clock.add(ClockSample(step / 2, boot_s, 0.01))
+    assert clock.matches(ClockSample(21.0, boot_s + 1.5 * after, 0.01))
 
 
 def test_hardware_alone_proves_only_previously_proven_link() -> None:
@@ -153,14 +153,14 @@ def test_hardware_alone_proves_only_previously_proven_link() -> None:
         choice.choose(0.0)
         for step in range(10):
             for link in (0, 1) if was_proven else (0,):
-                choice.record_answer(link, step, step + 70.0, 0.01, step)
+                choice.record_answer(link, ClockSample(step, step + 70.0, 0.01), step)
         choice.record_hardware(0, HardwareId(b"A" * 18, 0))
-        choice.record_answer(0, 10.0, 1.0, 0.01, 10.0)
+        choice.record_answer(0, ClockSample(10.0, 1.0, 0.01), 10.0)
         second = choice.candidates[1]
         assert (second.is_same_vehicle, second.was_same_vehicle) == (None, was_proven)
         for step in range(11, 20):
             choice.record_hardware(1, HardwareId(b"A" * 18, 0))
-            choice.record_answer(1, step, step - 11.0, 0.01, step)
+            choice.record_answer(1, ClockSample(step, step - 11.0, 0.01), step)
         assert bool(second.is_same_vehicle) is was_proven
         choice.record_hardware(1, HardwareId(b"B" * 18, 0))
         assert not choice.may_be_used(second)
@@ -173,12 +173,12 @@ def test_other_hardware_after_reboot_outweighs_the_clock() -> None:
         choice.record_heartbeat(link, 0.0, is_costly=False)
     choice.choose(0.0)
     for step in range(10):
-        choice.record_answer(0, step, step + 70.0, 0.01, step)
+        choice.record_answer(0, ClockSample(step, step + 70.0, 0.01), step)
     choice.record_hardware(0, HardwareId(b"A" * 18, 0))
-    choice.record_answer(0, 10.0, 1.0, 0.01, 10.0)
+    choice.record_answer(0, ClockSample(10.0, 1.0, 0.01), 10.0)
     for step in range(11, 20):
         choice.record_hardware(1, HardwareId(b"B" * 18, 0))
-        choice.record_answer(1, step, step - 9.0, 0.01, step)
+        choice.record_answer(1, ClockSample(step, step - 9.0, 0.01), step)
     assert not choice.may_be_used(choice.candidates[1])
 
 

@@ -22,9 +22,9 @@ def merged() -> MergedStreams:
         previous=None,
         candidates={USED: used, OTHER: other},
         may_be_used=lambda _: True,
-        is_shared=lambda *_: True,
+        carries_same_stream=lambda *_: True,
         fresh_after=float("-inf"),
-        changed_at=float("-inf"),
+        switched_at=float("-inf"),
     )
     return MergedStreams(2, {1: choice})
 

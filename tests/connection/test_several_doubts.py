@@ -15,6 +15,7 @@ from aerokit import messages as m
 from aerokit.connection.connection import Connection
 from aerokit.connection.multilink.link_choice import MAX_SWITCH_DELAY_S, MIN_COPIES, Candidate, LinkChoice
 from aerokit.connection.multilink.link_probes import UNATTACHED_RATE_HZ
+from aerokit.connection.multilink.vehicle_clock import ClockSample
 from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, LinkLost, LinkOpenError
 from aerokit.events import LinkState
@@ -110,13 +111,13 @@ def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
         for link in (0, 1):
             choice.record_heartbeat(link, now, is_costly=False)
         choice.choose(now)
-        choice.record_answer(0, now, 100.0 + now, 0.02, now)
-        choice.record_answer(1, now, 90.0 + now, 0.02, now)
+        choice.record_answer(0, ClockSample(now, 100.0 + now, 0.02), now)
+        choice.record_answer(1, ClockSample(now, 90.0 + now, 0.02), now)
         now += 0.5
     assert choice.candidates[1].is_same_vehicle is False
     while now < 3000.0:
         choice.record_heartbeat(1, now, is_costly=False)
-        choice.record_answer(1, now, 90.0 + now, 0.02, now)
+        choice.record_answer(1, ClockSample(now, 90.0 + now, 0.02), now)
         choice.choose(now)
         assert choice.used is choice.candidates[0]
         now += 0.5
@@ -127,12 +128,12 @@ def test_late_link_is_proven_by_its_clock() -> None:
     while now < 30.0:
         choice.record_heartbeat(0, now, is_costly=False)
         choice.choose(now)
-        choice.record_answer(0, now, 100.0 + now, 0.02, now)
+        choice.record_answer(0, ClockSample(now, 100.0 + now, 0.02), now)
         now += 0.5
     now = 600.0
     for _ in range(4):
         choice.record_heartbeat(1, now, is_costly=False)
-        choice.record_answer(1, now - 0.1, 100.03 + now - 0.1, 0.2, now)
+        choice.record_answer(1, ClockSample(now - 0.1, 100.03 + now - 0.1, 0.2), now)
         now += 0.5
     choice.choose(now)
     assert choice.used is choice.candidates[1]

@@ -14,7 +14,7 @@ import aerokit
 from aerokit import events
 from aerokit import messages as m
 from aerokit.connection.multilink.link_choice import MAX_ANSWERS_WITHOUT_HARDWARE, MIN_CLOCK_MATCHES, LinkChoice
-from aerokit.connection.multilink.vehicle_clock import HardwareId
+from aerokit.connection.multilink.vehicle_clock import ClockSample, HardwareId
 from aerokit.errors import AerokitError, CommandTimeout
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import VIRTUAL_BACKEND
@@ -187,7 +187,7 @@ class Answers:
                 self.choice.record_heartbeat(link, self.now, is_costly=False)
                 if self.choice.should_request_hardware(candidate := self.choice.candidates[link], is_attached=True):
                     candidate.count_hardware_request()
-                self.choice.record_answer(link, self.now, self.now + ahead_s, 0.01, self.now)
+                self.choice.record_answer(link, ClockSample(self.now, self.now + ahead_s, 0.01), self.now)
             self.choice.choose(self.now)
 
 

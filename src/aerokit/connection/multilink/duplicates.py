@@ -185,8 +185,8 @@ class MergedStreams:
         if used is None or used.is_other_hardware or not frame.has_arrived_from_owner_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # A frame that arrives over the link in use counts for all links with an earlier copy. A later copy counts
-            # for its own link and for the link in use.
+            # A copy over the link in use counts for every link with an earlier copy. A copy over another link counts
+            # for that link and for the link in use.
             is_new = link == used.link or candidate.link in (link, used.link)
             if is_new and frame.has_arrived_from_owner_over(candidate.link):
                 candidate.record_copy(now)
@@ -196,9 +196,19 @@ class MergedStreams:
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)
-        if choice is None or choice.used is None:
-            self.copies.current.is_delivered = True
-            return True  # No link is chosen for a sender without heartbeats, e.g. a radio.
+        # No link is chosen for a sender without heartbeats, e.g. a radio. All its frames are accepted.
+        if choice is not None and choice.used is not None:
+            is_used_link = link == choice.used.link
+            if not self._fits_choice(frame, link, choice, stream, is_used_link=is_used_link):
+                return False
+            # A late answer over an unused link must not lower `newest_sequence`, or older telemetry would be accepted.
+            # The link in use always sets it, because a rebooted vehicle begins with any number.
+            if is_used_link or not stream.has_newer(frame):
+                stream.newest_sequence = frame.sequence
+        self.copies.current.is_delivered = True
+        return True
+
+    def _fits_choice(self, frame: Frame, link: int, choice: LinkChoice, stream: _Stream, *, is_used_link: bool) -> bool:
         candidate = choice.candidates.get(link)
         if candidate is not None and not choice.may_be_used(candidate):
             return False
@@ -207,18 +217,12 @@ class MergedStreams:
         # A late frame that equals an accepted one is probably a delayed copy.
         if self.copies.may_be_late_copy and not _may_be_different_frame(frame, link, choice):
             return False
-        if link != choice.used.link and not _accepts_over_unused_link(frame, candidate, choice, stream):
+        if not is_used_link and not _accepts_over_unused_link(frame, candidate, choice, stream):
             return False
-        is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
-        if is_after_change and frame.message_id in ACKNOWLEDGEMENTS:
-            is_repeated = stream.count_acknowledgement(frame.payload, link)  # counts those of the link in use, too
-            if is_repeated and link != choice.used.link:
-                return False
-        # A late answer over an unused link must not lower `newest_sequence`, or older telemetry would be accepted. The
-        # link in use always sets it, because a rebooted vehicle begins with any number.
-        if link == choice.used.link or not stream.has_newer(frame):
-            stream.newest_sequence = frame.sequence
-        self.copies.current.is_delivered = True
+        is_after_switch = frame.received_at - choice.switched_at <= ANSWER_TIMEOUT_S
+        if is_after_switch and frame.message_id in ACKNOWLEDGEMENTS:
+            # Acknowledgements over the link in use are counted, but never refused.
+            return not stream.count_acknowledgement(frame.payload, link) or is_used_link
         return True
 
     def _stream(self, frame: Frame) -> _Stream:
@@ -235,15 +239,15 @@ def _accepts_over_unused_link(frame: Frame, candidate: Candidate | None, choice:
     if candidate is None or choice.used is None:
         return False
     is_answer = frame.message_id in ANSWERS
-    if choice.is_shared(candidate, frame.received_at):
+    if choice.carries_same_stream(candidate, frame.received_at):
         # Both links carry the same stream. The link in use has lost this frame, or delivers it later. Telemetry is
         # refused if a newer frame was already accepted; an answer is valid in any case.
         return is_answer or not stream.has_newer(frame)
     # The links carry separate streams. This frame is needed in two cases: only this link reaches the component, or the
     # frame answers a request from before the switch to the link in use.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S
-    is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
-    return not is_on_used_link or (is_answer and candidate is choice.previous and is_after_change)
+    is_after_switch = frame.received_at - choice.switched_at <= ANSWER_TIMEOUT_S
+    return not is_on_used_link or (is_answer and candidate is choice.previous and is_after_switch)
 
 
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:
@@ -253,4 +257,4 @@ def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool
         return False
     # If no other link carries the same frames, each link has its own stream of heartbeats, and two of them can be equal
     # by chance.
-    return not choice.is_shared(used, frame.received_at)
+    return not choice.carries_same_stream(used, frame.received_at)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.connection.multilink.vehicle_clock import VehicleClock
 
 if TYPE_CHECKING:
-    from aerokit.connection.multilink.vehicle_clock import HardwareId
+    from aerokit.connection.multilink.vehicle_clock import ClockSample, HardwareId
 
 # Probes are answered twice a second, so a link counts as dead after this silence.
 PROBED_TIMEOUT_S = 1.0
@@ -38,7 +38,7 @@ class Candidate:
         """Time of the last frame received from the system over the link. May be 0.1 s too late."""
         self.answered_at: float = -math.inf
         """Time of the last answer to a probe."""
-        self.shared_at: float = -math.inf
+        self.copied_at: float = -math.inf
         """Time of the last frame that was received both over this link and over the link in use."""
         self.is_available: bool = True
         """True while the link is open."""
@@ -100,7 +100,7 @@ class Candidate:
 
         Call this only for frames with a time since boot. Other frames of two vehicles may be equal.
         """
-        self.shared_at = now
+        self.copied_at = now
         self._copies += 1
         if self._copies >= MIN_COPIES and not self.is_other_hardware:
             self.is_same_vehicle = True
@@ -173,7 +173,7 @@ class Candidate:
 
 
 # Two links count as carrying the same stream for this time after a frame was received over both.
-SHARED_MAX_AGE_S = 5.0
+SAME_STREAM_MAX_AGE_S = 5.0
 
 # A link that works is replaced only if another link costs less than this fraction of its cost for at least
 # MIN_BETTER_S.
@@ -182,8 +182,8 @@ MIN_BETTER_S = 3.0
 
 JITTER_S = 0.05
 
-# A switch of the link waits until no command is in transit, but not longer than this. A continuous stream of set-points
-# would otherwise prevent it.
+# A switch to a better link waits until no command is in transit, but not longer than this, because during a continuous
+# stream of set-points a command is always in transit.
 MAX_SWITCH_DELAY_S = 10.0
 
 
@@ -200,7 +200,7 @@ class LinkChoice:
         self.candidates: dict[int, Candidate] = {}  # by index of the link
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
-        """The vehicle's hardware id, received over the link that was in use then."""
+        """Hardware id of the vehicle, received over a link while it was the link in use; None if unknown."""
         # Index of the link whose next hardware id replaces `hardware` even if the two differ. This is the link that
         # delivered `hardware` or, after a reboot, the link over which the reboot was detected. None at first.
         self._hardware_link: int | None = None
@@ -208,7 +208,7 @@ class LinkChoice:
         """The link in use; None before the first choice."""
         self.previous: Candidate | None = None
         """The link in use before the last switch. Answers may still arrive over it."""
-        self.changed_at: float = -math.inf  # time of the last choice of another link
+        self.switched_at: float = -math.inf  # time of the last switch to another link
         self.fresh_after: float = -math.inf
         """Telemetry that arrives before this time may be older than the last telemetry of the previous link."""
         self._better: Candidate | None = None  # link that is better than the link in use, since `_better_since`
@@ -229,18 +229,18 @@ class LinkChoice:
             self.used = None  # The link used so far leads to another component only, e.g. a camera.
             self.candidates = {candidate.link: candidate}  # `choose` then selects this link.
 
-    def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
-        """Record a probe's answer. The vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
+    def record_answer(self, link: int, sample: ClockSample, now: float) -> None:
+        """Record a probe's answer, which contains the time of the vehicle's clock."""
         candidate = self.candidates[link]
         # True if the link in use has not answered since the previous answer over this link. This is checked before
         # `record_round_trip` replaces the time of that answer.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
-        candidate.record_round_trip(round_trip_s, now)
+        candidate.record_round_trip(sample.round_trip_s, now)
         if candidate is self.used:
-            self._update_clock(link, at, vehicle_s, round_trip_s)
+            self._update_clock(link, sample)
             return
         candidate.count_answer()
-        matches = self.clock.matches(at, vehicle_s, round_trip_s)
+        matches = self.clock.matches(sample)
         if not matches and is_used_silent:
             # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove that
             # this is another vehicle. Only a matching hardware id counts; otherwise the answer is ignored (None).
@@ -248,8 +248,8 @@ class LinkChoice:
         if matches is not None:
             candidate.record_clock(matches, awaits_hardware=self._awaits_hardware(candidate))
 
-    def _update_clock(self, link: int, at: float, vehicle_s: float, round_trip_s: float) -> None:
-        if not self.clock.add(at, vehicle_s, round_trip_s):
+    def _update_clock(self, link: int, sample: ClockSample) -> None:
+        if not self.clock.add(sample):
             # The clock jumped, so the vehicle has rebooted or was replaced by another vehicle. The next hardware id
             # over this link is therefore accepted as the vehicle's id.
             self._hardware_link = link
@@ -275,9 +275,9 @@ class LinkChoice:
             return False
         return self.used in (None, candidate) or candidate.is_same_vehicle is True or not self.has_autopilot
 
-    def is_shared(self, candidate: Candidate, now: float) -> bool:
-        """Return True if the link carries the same frames as the link in use."""
-        return now - candidate.shared_at <= SHARED_MAX_AGE_S
+    def carries_same_stream(self, candidate: Candidate, now: float) -> bool:
+        """Return True if the link carries the same frames as the link in use (for the link in use: as another link)."""
+        return now - candidate.copied_at <= SAME_STREAM_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:
         """Select the link to use. Return the reason if it changes, otherwise None."""
@@ -288,9 +288,9 @@ class LinkChoice:
             return None
         best, used = alive[0], self.used
         if used is None:
-            return self._change(best, "first heard", now)
+            return self._switch_to(best, "first heard", now)
         if used not in alive:
-            return self._change(best, used.failure(), now)
+            return self._switch_to(best, used.failure(), now)
         is_better = best.is_costly < used.is_costly or best.cost_s < MAX_COST_RATIO * used.cost_s
         # A better link replaces the link in use only after it has stayed the best for MIN_BETTER_S.
         if best is used or not is_better:
@@ -298,7 +298,7 @@ class LinkChoice:
         elif best is not self._better:
             self._better, self._better_since = best, now
         elif now - self._better_since >= MIN_BETTER_S and not self._must_delay_switch(used, now):
-            return self._change(best, "cheaper" if best.is_costly < used.is_costly else "better", now)
+            return self._switch_to(best, "cheaper" if best.is_costly < used.is_costly else "better", now)
         return None
 
     def record_command(self, now: float) -> None:
@@ -338,7 +338,7 @@ class LinkChoice:
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S
 
-    def _change(self, chosen: Candidate, reason: str, now: float) -> str:
+    def _switch_to(self, chosen: Candidate, reason: str, now: float) -> str:
         previous = self.used
         if previous is not None:
             # Until `fresh_after`, the new link may deliver telemetry that is older than the previous link's last frame.
@@ -349,7 +349,7 @@ class LinkChoice:
             previous.is_same_vehicle = not previous.is_other_hardware
         self.previous = previous
         self.used = chosen
-        self.changed_at = now
+        self.switched_at = now
         self._better = None
         self._adopt_hardware(chosen)
         return reason

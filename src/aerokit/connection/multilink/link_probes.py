@@ -9,7 +9,7 @@ import logging
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from aerokit.connection.multilink.vehicle_clock import HardwareId
+from aerokit.connection.multilink.vehicle_clock import ClockSample, HardwareId
 from aerokit.events import DuplicateSender
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavComponent
@@ -115,7 +115,8 @@ class LinkProbes:
         choice = self._choices.get(frame.system_id)
         if round_trip_s is not None and choice is not None and link in choice.candidates:
             # The vehicle read its clock at about the middle of the round trip.
-            choice.record_answer(link, now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s, now)
+            sample = ClockSample(now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s)
+            choice.record_answer(link, sample, now)
             self._report_other_vehicle(frame, choice.candidates[link])
         return True
 

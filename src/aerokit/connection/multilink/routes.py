@@ -222,14 +222,13 @@ class MultiLinkRoutes:
 
         ``is_other_peer`` is the result of `arrived_on_other_peer`.
         """
-        # PX4 forwards our heartbeats from one of its ports to its other ports. Another program with our ids is ignored,
-        # too.
+        # PX4 forwards our heartbeats from one of its ports to the others, so they come back over another link.
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link_index(peer)
         if not self._merged.is_duplicate(frame, link, is_other_peer=is_other_peer):
             return False
-        if is_other_peer:  # A second sender proves nothing, because commands over this link go to the first sender.
+        if is_other_peer:  # A second sender's copy proves nothing, because commands over this link go to the first.
             return True
         # A copy is not delivered. It still proves that this link works, and which vehicle the link leads to.
         self._probes.record_hardware(frame, link)
@@ -283,7 +282,7 @@ class MultiLinkRoutes:
     def update(self, now: float) -> None:
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
-                # After a pause of the event loop, `received_at` is too old until the counts are recorded.
+                # The counts come first, because they update `received_at`, which is too old after a blocked event loop.
                 if counters := self._counters.get((system_id, link), {}).values():
                     received = sum(counter.received for counter in counters)
                     lost = sum(counter.lost for counter in counters)
@@ -314,30 +313,28 @@ class MultiLinkRoutes:
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
         """Return peers that together reach every system that has a link in use."""
+        used = {system_id: choice for system_id, choice in self._choices.items() if choice.used is not None}
+        options_by_system = [self._options(system_id, choice, now) for system_id, choice in used.items()]
         peers: set[Peer] = set()
-        links_with_systems: set[int] = set()
-        # Each system has a list of options, one for each usable link: the peers on this link that reach the system. The
-        # link in use comes first.
-        options_by_system: list[list[Collection[Peer]]] = []
-        for system_id, choice in self._choices.items():
-            links_with_systems.update(choice.candidates)
-            if choice.used is not None:
-                usable = [
-                    candidate
-                    for candidate in choice.candidates.values()
-                    if candidate is not choice.used and choice.may_be_used(candidate) and candidate.is_alive(now)
-                ]
-                options_by_system.append(
-                    [self._peers_on(candidate.link, system_id, component_id=0) for candidate in (choice.used, *usable)]
-                )
         # The peers are chosen greedily. Systems with a single option come first, because their peers must be added in
         # any case. If these peers also reach a system with several options, no peer needs to be added for that system.
         for options in sorted(options_by_system, key=len):
             if not any(peers.issuperset(option) for option in options):
                 peers.update(options[0])
         # Links over which no system is known are added as well.
+        links_with_systems = {link for choice in self._choices.values() for link in choice.candidates}
         peers.update(LinkPeer(link, None) for link in range(len(self._routes)) if link not in links_with_systems)
         return peers
+
+    def _options(self, system_id: int, choice: LinkChoice, now: float) -> list[Collection[Peer]]:
+        """Return the peers that reach a system, for each of its usable links. The link in use comes first."""
+        usable = [
+            candidate
+            for candidate in choice.candidates.values()
+            if candidate is choice.used or (choice.may_be_used(candidate) and candidate.is_alive(now))
+        ]
+        usable.sort(key=lambda candidate: candidate is not choice.used)
+        return [self._peers_on(candidate.link, system_id, component_id=0) for candidate in usable]
 
     def _choose(self, system_id: int, choice: LinkChoice, now: float) -> None:
         before = choice.used

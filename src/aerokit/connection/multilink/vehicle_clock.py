@@ -6,6 +6,7 @@ therefore differ by more than the round-trip time.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -25,88 +26,90 @@ MAX_PAUSE_S = 10.0  # A simulation that was paused for longer counts as rebooted
 SPEED_MAX_AGE_S = 5.0  # A clock rate measured before a pause or reboot remains valid for this time.
 
 
-class VehicleClock:
-    """Estimates the clock of one vehicle from samples.
+class ClockSample(NamedTuple):
+    """One reading of a vehicle's clock, in seconds. It showed ``vehicle_s`` when ours showed ``at``."""
 
-    In each sample, the vehicle's clock showed ``vehicle_s`` when ours showed ``at``, in seconds.
-    """
+    at: float
+    vehicle_s: float
+    round_trip_s: float
+    """Time between request and answer. ``at``, which is in the middle, may be wrong by half of it."""
+
+
+class VehicleClock:
+    """Estimates the clock of one vehicle from samples: its rate relative to our clock, and its reboots."""
 
     def __init__(self) -> None:
-        # (our time, the vehicle's time) in seconds.
-        self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
+        self._samples: deque[ClockSample] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
         """True if the last sample was as expected from the rate; False after a pause or reboot."""
-        # Clock rate before the last pause or reboot, and our time of the first sample after it.
-        self._previous_rate: tuple[float, float] | None = None
+        self._rate_before: float | None = None  # clock rate before the last pause or reboot
+        self._interrupted_at = -math.inf  # time of the first sample after it, on our clock
 
-    def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
+    def add(self, sample: ClockSample) -> bool:
         """Add a sample from the link in use. Return False if the vehicle rebooted."""
-        continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
-        is_unexpected = self._fits(at, vehicle_s, round_trip_s) is False  # None: the rate is not known yet
+        continues = not self._samples or self._continues(sample)
+        is_unexpected = self._fits(sample) is False  # None: the rate is not known yet
         self.is_steady = continues and not is_unexpected
         if not self.is_steady:
             if (rate := self._measured_rate) is not None:
-                self._previous_rate = rate, at
+                self._rate_before, self._interrupted_at = rate, sample.at
             self._samples.clear()  # A rate that is measured across a pause or reboot would be wrong.
-        self._samples.append((at, vehicle_s))
+        self._samples.append(sample)
         return continues
 
-    def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
+    def matches(self, sample: ClockSample) -> bool | None:
         """Return True if a sample from another link agrees with this clock. None means that this is unknown."""
-        fits = self._fits(at, vehicle_s, round_trip_s)
+        fits = self._fits(sample)
         # Until the rate is measured, a mismatch proves nothing, because a simulation may run at any rate.
         if self._measured_rate is None and not fits:
             return None
         return fits
 
-    def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
+    def _fits(self, sample: ClockSample) -> bool | None:
         """Return True if a sample agrees with the last one. None while the rate is unknown."""
         rate = self._rate
         if rate is None:
             return None
-        last_at, last_vehicle_s = self._samples[-1]
-        tolerance = self._tolerance_s(at, round_trip_s, rate)
-        return abs(last_vehicle_s + rate * (at - last_at) - vehicle_s) <= tolerance
+        last = self._samples[-1]
+        expected_s = last.vehicle_s + rate * (sample.at - last.at)
+        return abs(expected_s - sample.vehicle_s) <= self._tolerance_s(sample, rate)
 
-    def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
+    def _continues(self, sample: ClockSample) -> bool:
         """Return False if the vehicle's clock went back, ran too fast or stood still for too long."""
-        last_at, last_vehicle_s = self._samples[-1]
-        advance_s = vehicle_s - last_vehicle_s
+        last = self._samples[-1]
+        elapsed_s = sample.at - last.at
+        advance_s = sample.vehicle_s - last.vehicle_s
         rate = self._measured_rate
         if rate is None:
-            # The rate of the vehicle's clock is not measured yet. In a simulation, it may be up to MAX_SPEED.
-            max_advance_s = MAX_SPEED * (at - last_at + MIN_TOLERANCE_S + round_trip_s)
-            return -MIN_TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
-        tolerance_s = self._tolerance_s(at, round_trip_s, rate)
-        expected_s = rate * (at - last_at)
+            # In a simulation, the clock may run at any rate up to MAX_SPEED.
+            tolerance_s = MIN_TOLERANCE_S + sample.round_trip_s
+            return -tolerance_s <= advance_s <= MAX_SPEED * (elapsed_s + tolerance_s)
+        tolerance_s = self._tolerance_s(sample, rate)
+        expected_s = rate * elapsed_s
         min_advance_s = max(0.0, expected_s - MAX_PAUSE_S * max(1.0, rate))
         return min_advance_s - tolerance_s <= advance_s <= expected_s + tolerance_s
 
-    def _tolerance_s(self, at: float, round_trip_s: float, rate: float) -> float:
-        last_at, _ = self._samples[-1]
-        drift_s = min(MAX_SPEED_ERROR * abs(at - last_at), MAX_DRIFT_S)
-        return (MIN_TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, rate)
+    def _tolerance_s(self, sample: ClockSample, rate: float) -> float:
+        drift_s = min(MAX_SPEED_ERROR * abs(sample.at - self._samples[-1].at), MAX_DRIFT_S)
+        return (MIN_TOLERANCE_S + sample.round_trip_s / 2 + drift_s) * max(1.0, rate)
 
     @property
     def _rate(self) -> float | None:
         """Rate of the clock, measured now or before a pause or reboot. None if it is unknown."""
         if self._measured_rate is not None:
             return self._measured_rate
-        if self._previous_rate is None:
-            return None
-        rate, interrupted_at = self._previous_rate
-        last_at, _ = self._samples[-1]
-        return rate if last_at - interrupted_at <= SPEED_MAX_AGE_S else None
+        is_recent = bool(self._samples) and self._samples[-1].at - self._interrupted_at <= SPEED_MAX_AGE_S
+        return self._rate_before if is_recent else None
 
     @property
     def _measured_rate(self) -> float | None:
         """Seconds of the vehicle's clock per second of ours. None if the samples span too short a time."""
         if not self._samples:
             return None
-        (first_at, first_vehicle_s), (last_at, last_vehicle_s) = self._samples[0], self._samples[-1]
-        if last_at - first_at < MIN_SPAN_S:
+        first, last = self._samples[0], self._samples[-1]
+        if last.at - first.at < MIN_SPAN_S:
             return None
-        rate = (last_vehicle_s - first_vehicle_s) / (last_at - first_at)
+        rate = (last.vehicle_s - first.vehicle_s) / (last.at - first.at)
         return 1.0 if abs(rate - 1) <= REAL_TIME_TOLERANCE else rate
 
 
