@@ -7,7 +7,7 @@ import copy
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import anyio
 
@@ -40,14 +40,21 @@ Sink = Callable[[Any], None]
 
 EventT = TypeVar("EventT", bound=Event)
 
-# (kind, sink). The kind says which arguments the sink takes: MESSAGE, FRAME, or BOTH.
-_Entry = tuple[int, Callable[..., None]]
+# What a sink is called with. LAZY: sink(frame), or sink(frame, message) if another sink needs the message decoded.
+MESSAGE, FRAME, LAZY = range(3)
+# The sinks for one message are called with different arguments.
+MIXED = 3
 
-MESSAGE, FRAME, BOTH = range(3)
 
-# (kind, all sinks). The kind is MESSAGE if every sink takes only the message, FRAME if no sink needs the message
-# decoded, otherwise BOTH.
-_DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
+class _Entry(NamedTuple):
+    takes: int  # MESSAGE, FRAME or LAZY
+    sink: Callable[..., None]
+
+
+class _DeliveryPlan(NamedTuple):
+    takes: int  # MESSAGE or FRAME if all sinks can be called with the same item, otherwise MIXED
+    sinks: tuple[Callable[..., None], ...]
+
 
 EVERY_SYSTEM = 0
 _HEARTBEAT_ID = 0
@@ -63,7 +70,7 @@ class Bus:
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
         self.must_check_frames = False
-        """True if the owner must check each frame before its delivery. :meth:`deliver_all` then stops early."""
+        """True if the owner must check frames before they are delivered. It makes :meth:`deliver_all` stop."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}  # the key is (system id, message id)
         self._plans: dict[int, _DeliveryPlan] = {}  # cache; the key is system id << 24 | message id
@@ -71,7 +78,7 @@ class Bus:
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Deliver every ``message_type`` of ``system_id`` (0: of every system) to ``sink``."""
-        return self._attach((system_id, message_type.ID), (MESSAGE, sink))
+        return self._attach((system_id, message_type.ID), _Entry(MESSAGE, sink))
 
     def require_frames(self, *message_types: type[Message]) -> None:
         """Make the framer return frames of these types even if no sink is attached."""
@@ -80,7 +87,7 @@ class Bus:
 
     def attach_frames(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Like :meth:`attach`, but ``sink`` gets the undecoded frame."""
-        return self._attach((system_id, message_type.ID), (FRAME, sink))
+        return self._attach((system_id, message_type.ID), _Entry(FRAME, sink))
 
     def attach_lazily(
         self,
@@ -90,7 +97,7 @@ class Bus:
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
         """Call ``sink(frame)``, or ``sink(frame, message)`` if another sink needs the message decoded anyway."""
-        return self._attach((system_id, message_type.ID), (BOTH, sink))
+        return self._attach((system_id, message_type.ID), _Entry(LAZY, sink))
 
     def create_on_first(
         self, message_ids: Iterable[int], create: Callable[[], object], *, system_id: int = EVERY_SYSTEM
@@ -104,17 +111,17 @@ class Bus:
         def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
-            detach_all()  # This function is defined below, before any frame arrives.
+            detach_all()
             # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
                 if entry not in entries_before:
-                    kind, sink = entry
                     try:
-                        sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
+                        entry.sink(self.dialect.decode(frame) if entry.takes == MESSAGE else frame)
                     except Exception:
-                        _report(sink)
+                        _report(entry.sink)
 
-        detachers = [self._attach((system_id, message_id), (FRAME, on_first), ahead=True) for message_id in message_ids]
+        first = _Entry(FRAME, on_first)
+        detachers = [self._attach((system_id, message_id), first, ahead=True) for message_id in message_ids]
 
         def detach_all() -> None:
             for detach in detachers:
@@ -136,8 +143,8 @@ class Bus:
     ) -> Frame | None:
         """Deliver the frames in order, like :meth:`deliver`. Stop after a frame whose sink sets `must_check_frames`.
 
-        Returns the frame after which delivery stopped; None if all frames were delivered without a stop. Calls
-        ``before_heartbeat(frame, *context)`` before each HEARTBEAT is delivered.
+        Returns the frame after which delivery stopped, or None. Calls ``before_heartbeat(frame, *context)`` before each
+        HEARTBEAT is delivered.
         """
         plans, decode = self._plans, self.dialect.decode
         for frame in frames:
@@ -145,13 +152,13 @@ class Bus:
             if message_id == _HEARTBEAT_ID:
                 before_heartbeat(frame, *context)
             try:
-                kind, sinks = plans[frame.system_id << 24 | message_id]
+                takes, sinks = plans[frame.system_id << 24 | message_id]
             except KeyError:
-                kind, sinks = self._plan(frame)
-            if kind == BOTH:
-                self._deliver_both(frame)
+                takes, sinks = self._plan(frame)
+            if takes == MIXED:
+                self._deliver_mixed(frame)
             else:
-                item = frame if kind == FRAME else decode(frame)
+                item = frame if takes == FRAME else decode(frame)
                 for sink in sinks:
                     try:
                         sink(item)
@@ -161,13 +168,13 @@ class Bus:
                 return frame
         return None
 
-    def _deliver_both(self, frame: Frame) -> None:
+    def _deliver_mixed(self, frame: Frame) -> None:
         message = self.dialect.decode(frame)
-        for kind, sink in self._entries(frame):
+        for takes, sink in self._entries(frame):
             try:
-                if kind == MESSAGE:
+                if takes == MESSAGE:
                     sink(message)
-                elif kind == FRAME:
+                elif takes == FRAME:
                     sink(frame)
                 else:
                     sink(frame, message)
@@ -197,15 +204,15 @@ class Bus:
         entries = self._entries(frame)
         # A message outside the dialect has no sinks, because it cannot be decoded.
         if not entries or self.dialect.get(frame.message_id) is None:
-            return FRAME, ()
-        kinds = {kind for kind, _ in entries}
-        if MESSAGE not in kinds:
-            kind = FRAME  # No sink needs the message decoded: sinks of kind BOTH also accept the frame alone.
-        elif kinds == {MESSAGE}:
-            kind = MESSAGE
+            return _DeliveryPlan(FRAME, ())
+        taken = {entry.takes for entry in entries}
+        if MESSAGE not in taken:
+            takes = FRAME  # LAZY sinks accept the frame alone.
+        elif taken == {MESSAGE}:
+            takes = MESSAGE
         else:
-            kind = BOTH
-        plan = kind, tuple(sink for _, sink in entries)
+            takes = MIXED
+        plan = _DeliveryPlan(takes, tuple(entry.sink for entry in entries))
         self._plans[frame.system_id << 24 | frame.message_id] = plan
         return plan
 
@@ -244,7 +251,7 @@ def once(action: Callable[[], None]) -> Detach:
 
     def detach() -> None:
         if pending:
-            pending.pop()()  # The action is removed before its call, because it may call detach() itself.
+            pending.pop()()  # The action is removed before it is called, because it may call detach() itself.
 
     return detach
 

@@ -35,7 +35,7 @@ class Feed(Protocol):
         """Decode the pending messages now."""
 
     def watchers_changed(self) -> None:
-        """Called when ``_is_watched`` of one of the cells may have changed."""
+        """Called when a waiter, observer or iterator was added to one of the cells or removed from it."""
 
 
 class Source(Snapshot):

@@ -1,4 +1,4 @@
-"""Runs a sans-IO exchange on the event loop, with one future and one deadline."""
+"""Runs an `Exchange`, which is a protocol's state machine without I/O, on the event loop."""
 
 from __future__ import annotations
 

@@ -198,38 +198,42 @@ class FrameReceiver:
             self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
-        framers, multilink, signatures, observers = self.framers, self._multilink, self._signatures, self.observers
         # True if frames arrived out of order (late), or may be those of a second sender with the same ids (foreign).
         has_suspects = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # A sink of an earlier frame has closed the connection.
                 return
-            is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
-            if multilink is not None and multilink.is_duplicate(frame, peer, is_other_peer=is_other_peer):
+            if not self._check_and_record(frame, framer, peer, has_suspects=has_suspects):
                 continue
-            # With several links, `_is_admitted` is always called, because it records the admission.
-            must_check = multilink is not None or not signatures.admits_all
-            if must_check and not self._is_admitted(frame, is_other_peer):
-                continue
-            # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that
-            # are not in use.
-            if observers.recording is not None and multilink is None:
-                observers.recording.write(frame.raw, self._clock())
-            if is_other_peer:
-                is_signed = signatures.has_verified(frame)
-                if not self._routes.try_move_route(frame, peer, is_signed=is_signed):
-                    continue
-            if has_suspects and self._must_be_dropped(framer, frame):
-                continue
-            if multilink is not None:
-                if not multilink.accepts(frame, peer, framer.counters_of(frame)):
-                    continue
-                observers.record_received(frame.raw, self._clock())
             if frame.message_id == _HEARTBEAT_ID:
                 self._record_heartbeat(frame, framer, peer)
             self._bus.deliver(frame)
-            if observers.receive_callbacks:
-                observers.notify_received(frame, peer)
+            if self.observers.receive_callbacks:
+                self.observers.notify_received(frame, peer)
+
+    def _check_and_record(self, frame: Frame, framer: Framer, peer: Peer, *, has_suspects: bool) -> bool:
+        """Check a frame, and write it to the recording of the connection. Return True if it is to be delivered."""
+        multilink, signatures, observers = self._multilink, self._signatures, self.observers
+        is_other_peer = len(self.framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
+        if multilink is not None and multilink.is_duplicate(frame, peer, is_other_peer=is_other_peer):
+            return False
+        # With several links, `_is_admitted` is always called, because it records the admission.
+        must_check = multilink is not None or not signatures.admits_all
+        if must_check and not self._is_admitted(frame, is_other_peer):
+            return False
+        # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that are
+        # not in use.
+        if observers.recording is not None and multilink is None:
+            observers.recording.write(frame.raw, self._clock())
+        if is_other_peer and not self._routes.try_move_route(frame, peer, is_signed=signatures.has_verified(frame)):
+            return False
+        if has_suspects and self._must_be_dropped(framer, frame):
+            return False
+        if multilink is not None:
+            if not multilink.accepts(frame, peer, framer.counters_of(frame)):
+                return False
+            observers.record_received(frame.raw, self._clock())
+        return True
 
     def arrived_at(self) -> float:
         """Return the earliest possible receive time of the current frame.

@@ -120,7 +120,7 @@ class LoopWatch:
 
     def slept_since(self, at: float) -> float:
         """Return how many seconds the computer was suspended since this loop time."""
-        # The timer may notice a suspension 0.2 s late.
+        # Check now, because the timer may notice a suspension up to 0.2 s later.
         if self._timer is not None and self._detect_sleep():
             self._start_catching_up()
         return sum(seconds for woke_at, seconds in self._sleeps if woke_at > at)
@@ -178,7 +178,6 @@ class LoopWatch:
         else:
             caught_up_after_s = self._loop.time() - self.oldest_arrival
             self.oldest_arrival = math.inf
-            # As in `_set_timer`: data that is read before this time has not waited.
             self.late_after = self._ran_at + CHECK_INTERVAL_S / 2
             self._on_caught_up(caught_up_after_s)  # last, because it may close the watch
 

@@ -55,7 +55,7 @@ class OtherPeer:
     def add(self, frame: Frame, expected: int, sequence_matches: bool | None, clock_matches: bool | None) -> None:
         """Record a frame, and whether its sequence number and time since boot fit the owner's frames (None: unknown).
 
-        ``expected`` is the owner's next sequence number.
+        ``expected`` is the owner's next sequence number, which changes with each frame of the owner.
         """
         if expected != self._expected:  # The owner has sent frames since the last call, so the comparison starts again.
             self._expected = expected
@@ -66,8 +66,7 @@ class OtherPeer:
             self._clock_matches = None
             self._began_at = frame.received_at
         self._frames += 1
-        # A mismatch of the clock is final. Otherwise another sender could try often enough until a frame matches by
-        # chance.
+        # A mismatch of the clock is final. Otherwise another sender could try until a frame matches by chance.
         if clock_matches is not None and self._clock_matches is not False:
             self._clock_matches = clock_matches
 
@@ -279,27 +278,17 @@ class Routes:
         return other
 
     def _compare(self, other: OtherPeer, route: _Route, frame: Frame) -> None:
-        sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
-        expected = 0
-        if route.counters is not None:
-            expected = route.counters.expected
-            # The owner's latest frames may be lost. We allow for 1.5 times its rate since its last heartbeat, plus 8.
-            max_ahead = 8 + 1.5 * route.rate * silent_s
-            # With a larger range, more than half of the 256 sequence numbers would match by chance.
-            if max_ahead < 128:
-                sequence_matches = (frame.sequence - expected) & 0xFF <= max_ahead
+        sequence_matches = _sequence_matches(frame, route, silent_s)
         clock = self._boot_clocks.get((frame.system_id, frame.component_id))
         expected_ms = None if clock is None else clock(frame.received_at)
-        boot_ms = boot_time_ms(frame)
-        clock_matches: bool | None = None
-        if expected_ms is None:
+        if expected_ms is not None:
+            clock_matches = _boot_time_matches(frame, expected_ms, silent_s)
+        else:
             # The unknown clock of the owner counts as matching, so that the sequence numbers alone decide. If they are
             # unknown, too, the result is unknown.
             clock_matches = None if sequence_matches is None else True
-        elif boot_ms is not None:
-            tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
-            clock_matches = abs(boot_ms - expected_ms) <= tolerance_ms
+        expected = 0 if route.counters is None else route.counters.expected
         other.add(frame, expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
@@ -343,6 +332,22 @@ class Routes:
 
 
 _SAME_PEER = object()  # key in `_other_peers` of a second sender that is received from the owner's peer
+
+
+def _sequence_matches(frame: Frame, route: _Route, silent_s: float) -> bool | None:
+    """Return True if a frame could be the next one of the route's owner by its sequence number. None if unknown."""
+    if route.counters is None:
+        return None
+    # The owner's latest frames may be lost. We allow for 1.5 times its rate since its last heartbeat, plus 8.
+    max_ahead = 8 + 1.5 * route.rate * silent_s
+    # With a larger range, more than half of the 256 sequence numbers would match by chance.
+    return (frame.sequence - route.counters.expected) & 0xFF <= max_ahead if max_ahead < 128 else None
+
+
+def _boot_time_matches(frame: Frame, expected_ms: float, silent_s: float) -> bool | None:
+    boot_ms = boot_time_ms(frame)
+    tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
+    return None if boot_ms is None else abs(boot_ms - expected_ms) <= tolerance_ms
 
 
 def _peer_name(peer: Peer) -> str:
