@@ -356,7 +356,7 @@ def test_plans_of_a_burst_equal_plans_of_single_frames(seed: int) -> None:
             both.append(
                 router.route_all(node, frames, now, late)
                 if number
-                else [router.route(node, frame, now, frame in late) for frame in frames]
+                else [router.route(node, frame, now, is_out_of_order=frame in late) for frame in frames]
             )
         for plan, other in zip(*both, strict=True):
             assert (plan.outs, plan.rate_limited, plan.reason, plan.key) == (

@@ -20,18 +20,18 @@ NOW = 1_700_000_000.0
 
 
 def test_everything_passes_without_filters() -> None:
-    assert Filters(STANDARD).period(Attitude.ID) == 0.0
-    assert Filters(STANDARD).period(51234) == 0.0
+    assert Filters(STANDARD).min_interval(Attitude.ID) == 0.0
+    assert Filters(STANDARD).min_interval(51234) == 0.0
 
 
 def test_only_block_and_rates() -> None:
     filters = Filters(STANDARD, only=["HEARTBEAT", "GPS_*"], block=["GPS_STATUS"], rates={"GPS_R*": 4, "*": 10})
-    assert filters.period(Heartbeat.ID) == pytest.approx(0.1)
-    assert filters.period(GpsRawInt.ID) == pytest.approx(0.25)
-    assert filters.period(25) is None
-    assert filters.period(Attitude.ID) is None
-    assert filters.period(51234) is None
-    assert Filters(STANDARD, block=["GPS_*"]).period(51234) == 0.0
+    assert filters.min_interval(Heartbeat.ID) == pytest.approx(0.1)
+    assert filters.min_interval(GpsRawInt.ID) == pytest.approx(0.25)
+    assert filters.min_interval(25) is None
+    assert filters.min_interval(Attitude.ID) is None
+    assert filters.min_interval(51234) is None
+    assert Filters(STANDARD, block=["GPS_*"]).min_interval(51234) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_unknown_messages_cannot_be_signed() -> None:
 
 def test_rate_for_all_excludes_answers() -> None:
     filters = Filters(STANDARD, rates={"*": 5, "LOG_DATA": 100})
-    assert filters.period(Attitude.ID) == pytest.approx(0.2)
+    assert filters.min_interval(Attitude.ID) == pytest.approx(0.2)
     for name in ("PARAM_VALUE", "COMMAND_ACK", "LOG_ENTRY", "STATUSTEXT"):
-        assert filters.period(next(kind.ID for kind in STANDARD if name == kind.NAME)) == 0.0
-    assert filters.period(120) == pytest.approx(0.01)
+        assert filters.min_interval(next(kind.ID for kind in STANDARD if name == kind.NAME)) == 0.0
+    assert filters.min_interval(120) == pytest.approx(0.01)

@@ -55,8 +55,8 @@ class Stage:
         encoder = self.encoders.setdefault(key, FrameEncoder(system, component))
         return self.pass_on(port, encoder.encode(message))
 
-    def pass_on(self, port: str, raw: bytes, *, is_late: bool = False) -> set[str]:
-        plan = self.router.route(self.nodes[port], Frame.parse(raw), self.now, is_late)
+    def pass_on(self, port: str, raw: bytes, *, is_out_of_order: bool = False) -> set[str]:
+        plan = self.router.route(self.nodes[port], Frame.parse(raw), self.now, is_out_of_order=is_out_of_order)
         self.reason, self.rate_limited = plan.reason, plan.rate_limited
         assert len(set(plan.outs)) == len(plan.outs)
         return set(plan.outs)
@@ -154,7 +154,7 @@ def test_copy_at_other_port_is_dropped_without_effect(stage: Stage) -> None:
 def test_repeated_frame_is_forwarded_once(stage: Stage) -> None:
     raw = FrameEncoder(1, 1).encode(COPTER)
     assert stage.pass_on("a", raw) == set("bcd")
-    assert stage.pass_on("a", raw, is_late=True) == set()
+    assert stage.pass_on("a", raw, is_out_of_order=True) == set()
     # The counter has come round, and the message is the same: that is another frame.
     assert stage.pass_on("a", raw) == set("bcd")
 

@@ -133,9 +133,9 @@ def test_first_order_at_same_port_later_is_no_copy() -> None:
     stage.receive("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
     stage.now += REPEAT_WINDOW_S / 2
-    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "duplicated by the network"
+    assert stage.pass_on("c", FIRST_ORDER, is_out_of_order=True) == set(), "duplicated by the network"
     stage.now += REPEAT_WINDOW_S
-    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == {"a"}
+    assert stage.pass_on("c", FIRST_ORDER, is_out_of_order=True) == {"a"}
 
 
 @pytest.mark.parametrize("component", [0, 1])

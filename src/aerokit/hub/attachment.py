@@ -127,8 +127,7 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        # Datagrams of one burst of a peer are joined and forwarded together. A datagram that does not begin with a
-        # frame is processed alone.
+        # The datagrams that the link reads from one peer at once are forwarded together, if each begins with a frame.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
@@ -225,7 +224,7 @@ class Attachment:
             endpoint=self.name,
             dialect=self._dialect,
             queue_above_bytes=self._queue_above_bytes(),
-            period=self.filters.period,
+            min_interval=self.filters.min_interval,
             report=partial(self._report, self),
             on_drop=self._on_drop,
             signer=self._signer,

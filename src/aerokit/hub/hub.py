@@ -162,7 +162,7 @@ class Hub:
         links = [attachment.link for attachment in self._attachments.values() if attachment.is_open]
         is_shared = any(isinstance(link, SharedLink) and link.connection is connection for link in links)
         if is_shared and name not in self._attachments:
-            # Each of two endpoints would send the vehicle what the other one receives from it.
+            # With two endpoints for one connection, the hub would send a vehicle its own frames.
             raise InvalidArgument("connection = … is not allowed: this hub shares it already")
         return (await self._add(Endpoint(SharedLink(connection), name=name))).statistics()
 
@@ -210,7 +210,7 @@ class Hub:
         self._attachments[attachment.name] = attachment
         try:
             await attachment.open()
-        except BaseException as error:  # A cancellation of the call, too.
+        except BaseException as error:  # including a cancellation of this call
             if not (endpoint.retry_open and isinstance(error, LinkError)):
                 if self._has(attachment):
                     del self._attachments[attachment.name]

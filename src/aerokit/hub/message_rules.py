@@ -58,7 +58,9 @@ class Filters:
         self._only = tuple(only)
         self._block = tuple(block)
         self._rates = dict(rates or {})
-        self._periods: dict[int, float | None] = {}  # results of `period`, which are computed at the first call
+        self._min_intervals: dict[
+            int, float | None
+        ] = {}  # results of `min_interval`, which are computed at the first call
         for field, patterns in (("only", self._only), ("block", self._block), ("rates", self._rates)):
             for pattern in patterns:
                 self._check(field, pattern)
@@ -68,17 +70,17 @@ class Filters:
                     f"rates: {pattern} = {hz:g} Hz is not allowed: it must be above 0, at most {MAX_RATE_HZ:g}"
                 )
 
-    def period(self, message_id: int) -> float | None:
+    def min_interval(self, message_id: int) -> float | None:
         """Return the minimum interval of a message in seconds: None if it is not sent, 0 if there is no limit."""
         if not (self._only or self._block or self._rates):
             return 0.0
         if message_id not in self._dialect.rows:  # An unknown message matches no pattern.
             return None if self._only else 0.0
-        if message_id not in self._periods:
-            self._periods[message_id] = self._period(self._dialect[message_id].NAME)
-        return self._periods[message_id]
+        if message_id not in self._min_intervals:
+            self._min_intervals[message_id] = self._min_interval(self._dialect[message_id].NAME)
+        return self._min_intervals[message_id]
 
-    def _period(self, name: str) -> float | None:
+    def _min_interval(self, name: str) -> float | None:
         if self._only and not any(fnmatchcase(name, pattern) for pattern in self._only):
             return None
         if any(fnmatchcase(name, pattern) for pattern in self._block):

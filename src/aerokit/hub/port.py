@@ -199,9 +199,8 @@ class Port:
     While the link accepts data, frames are collected in ``batch``, and `Switch` writes them. While more than
     ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. If the limit is `UNLIMITED`, they never wait.
 
-    ``endpoint`` is the endpoint's name. ``period(message_id)`` is the minimum interval in seconds of a message, see
-    `Filters.period`. ``report(kind, text)`` publishes an event of the endpoint. ``on_drop(reason, frame)`` is called
-    for each frame dropped from the queue.
+    ``endpoint`` is the endpoint's name, and ``min_interval`` its `Filters.min_interval`. ``report(kind, text)``
+    publishes an event of the endpoint. ``on_drop(reason, frame)`` is called for each frame dropped from the queue.
     """
 
     link: Link
@@ -216,7 +215,7 @@ class Port:
         endpoint: str,
         dialect: Dialect,
         queue_above_bytes: int,
-        period: Callable[[int], float | None],
+        min_interval: Callable[[int], float | None],
         report: Callable[[HubEventKind, str], object],
         on_drop: Callable[[str, QueuedFrame], object],
         signer: FrameSigner | None = None,
@@ -226,7 +225,7 @@ class Port:
         self.link, self.peer = link, peer
         self.counters = counters
         self.endpoint: str = endpoint
-        self.period: Callable[[int], float | None] = period
+        self.min_interval: Callable[[int], float | None] = min_interval
         self.report: Callable[[HubEventKind, str], object] = report
         self.reports_bursts: bool = link.reports_bursts
         self.signer: FrameSigner | None = signer
@@ -264,7 +263,7 @@ class Port:
             kind = kind_of(message_type.NAME, has_target=system_id != 0)
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
-    def passes_rate_limit(self, key: int, period_s: float, now: float) -> bool:
+    def passes_rate_limit(self, key: int, interval_s: float, now: float) -> bool:
         """Return True if the rate limit allows a frame now. Otherwise count the frame as dropped.
 
         ``key`` identifies the sender and the message.
@@ -276,11 +275,11 @@ class Port:
         if due_at is None:
             if len(self._due) >= MAX_RATE_LIMITS:
                 self._due.clear()  # This bounds the memory. Each message may then be sent once too early.
-            self._due[key] = now + period_s
+            self._due[key] = now + interval_s
         else:
-            # The next due time is counted from the previous due time rather than from now, so that irregular messages
-            # reach the allowed average rate. It is never before now, so that no burst follows a pause.
-            self._due[key] = max(due_at, now - period_s) + period_s
+            # The next due time is counted from the previous one, so that irregular messages reach the allowed average
+            # rate. It is never before now, so that no burst follows a pause.
+            self._due[key] = max(due_at, now - interval_s) + interval_s
         return True
 
     def flush(self, unix_time: float) -> None:

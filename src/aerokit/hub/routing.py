@@ -16,6 +16,7 @@ from aerokit.hub.senders import (
     MAX_RECENT_FRAMES,
     MIN_LOOP_FRAMES,
     REPEAT_WINDOW_S,
+    FrameRecord,
     RecentFrames,
     Sender,
     is_autopilot,
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from aerokit.hub.message_rules import TargetFields
-    from aerokit.hub.senders import FrameRecord
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.frame import Frame
 
@@ -120,17 +120,17 @@ class Router(Generic[PortT]):
     At most `MAX_ROUTES` senders are remembered. A new sender replaces a sender without heartbeats, or a sender that was
     silent for `PEER_TTL_S`. If there is none, messages for the new sender are dropped.
 
-    ``period(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if the message
-    does not go there, 0 without a limit. The interval applies per sender, to broadcasts only.
+    ``min_interval(port, message_id)`` returns the minimum interval of a message at a port in seconds: None if the
+    message does not go there, 0 without a limit. The interval applies per sender, to broadcasts only.
     """
 
-    def __init__(self, targets: TargetFields, period: Callable[[PortT, int], float | None]) -> None:
-        self._targets, self._period = targets, period
+    def __init__(self, targets: TargetFields, min_interval: Callable[[PortT, int], float | None]) -> None:
+        self._targets, self._min_interval = targets, min_interval
         self._offsets = targets.offsets
         self._ingresses: dict[int, Ingress[PortT]] = {}  # by port number
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
-        self._port_count = 0  # number of ports created so far
+        self._newest_port = 0  # number of the last created port
         self._without_heartbeat: dict[int, None] = {}  # These senders may be noise.
         self._swept_at = -math.inf  # time of the last removal of silent senders
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
@@ -145,8 +145,8 @@ class Router(Generic[PortT]):
         """
 
     def add(self, port: PortT) -> Ingress[PortT]:
-        self._port_count += 1
-        ingress = self._ingresses[self._port_count] = Ingress(port, self._port_count)
+        self._newest_port += 1
+        ingress = self._ingresses[self._newest_port] = Ingress(port, self._newest_port)
         self.forget_plans()
         return ingress
 
@@ -177,25 +177,26 @@ class Router(Generic[PortT]):
         )
 
     def route_all(
-        self, ingress: Ingress[PortT], frames: list[Frame], now: float, late: list[Frame]
+        self, ingress: Ingress[PortT], frames: list[Frame], now: float, out_of_order: list[Frame]
     ) -> list[ForwardingPlan[PortT]]:
-        """Return the plans for frames received together at ``ingress``. Those in ``late`` are out of order."""
+        """Return the plans for frames received together, of which some may have arrived ``out_of_order``."""
         # This is the hot path for new frames of known streams. `route` processes frames that are out of order or may
         # return in a loop, and all frames while the tables of recent frames are full or have expired.
         recent, streams, port_number = self._recent, ingress.streams, ingress.number
-        if late or ingress.echoes or now >= recent.rotate_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
-            return [self.route(ingress, frame, now, frame in late) for frame in frames]
+        is_full = now >= recent.rotate_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES
+        if out_of_order or ingress.echoes or is_full:
+            return [self.route(ingress, frame, now, is_out_of_order=frame in out_of_order) for frame in frames]
         newer, older, plans = recent.newer, recent.older, []
-        record = port_number, self._port_count, now  # value for `RecentFrames.newer`
+        record = FrameRecord(port_number, self._newest_port, now)
         for frame in frames:
             body = frame.body
             plan = streams.get(body[4:9])  # system id, component id and message id
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # Item 0 of a record is a port number. A frame is no copy of an earlier frame from the same port: their
-                # sequence numbers and checksums are equal by chance.
-                if is_new or (newer.get(identity) or older[identity])[0] == port_number:
+                # A frame is no copy of an earlier frame from the same port: their sequence numbers and checksums are
+                # equal by chance.
+                if is_new or (newer.get(identity) or older[identity]).port_number == port_number:
                     newer[identity] = record
                     plan.sender.received_at = now
                     plans.append(plan)
@@ -207,8 +208,10 @@ class Router(Generic[PortT]):
                 streams = {}
         return plans
 
-    def route(self, ingress: Ingress[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
-        """Return the plan for a frame received at ``ingress``. ``is_late``: the frame is out of order."""
+    def route(
+        self, ingress: Ingress[PortT], frame: Frame, now: float, *, is_out_of_order: bool = False
+    ) -> ForwardingPlan[PortT]:
+        """Return the plan for a frame received at ``ingress``."""
         # Hot path. Sender and target are numbers: system id + 256 · component id.
         body, message_id = frame.body, frame.message_id
         source = body[4] | body[5] << 8
@@ -223,20 +226,19 @@ class Router(Generic[PortT]):
         identity = source << 24 | body[3] << 16 | frame.checksum
         earlier = recent.newer.get(identity) or recent.older.get(identity)
         if earlier is None:
-            recent.newer[identity] = number, self._port_count, now
+            recent.newer[identity] = FrameRecord(number, self._newest_port, now)
             if ingress.echoes:
                 self._record_new_frame(ingress, source)
-        elif self._is_copy(earlier, number, now, is_late):
+        elif self._is_copy(earlier, number, now, is_out_of_order=is_out_of_order):
             return self._duplicate
         elif self._is_echo(earlier, number, now):
-            first_port, port_count, _ = earlier
             # Too late for a copy: the frame returns in a slow loop, or equals an earlier one by chance, like the first
             # command of a restarted program. It is forwarded until several frames prove a loop.
-            if self._record_echo(ingress, source, first_port, now):
+            if self._record_echo(ingress, source, earlier.port_number, now):
                 return self._loop
-            recent.newer[identity] = first_port, port_count, now
+            recent.newer[identity] = FrameRecord(earlier.port_number, earlier.newest_port, now)
         else:
-            recent.newer[identity] = number, self._port_count, now
+            recent.newer[identity] = FrameRecord(number, self._newest_port, now)
         if sender.port_number == number:
             sender.received_at = now
         else:
@@ -292,20 +294,20 @@ class Router(Generic[PortT]):
         if sender.is_autopilot and sender.port_number != former_number:
             self._report("route_changed", sender.source, ingress, former_number)
 
-    def _is_copy(self, earlier: FrameRecord, number: int, now: float, is_late: bool) -> bool:
+    def _is_copy(self, earlier: FrameRecord, number: int, now: float, *, is_out_of_order: bool) -> bool:
         """Return True if a frame that equals an earlier frame is a copy of it."""
         # A restarted program numbers its frames from the start again, so its first command may equal an earlier frame.
         # A frame that was received at the same port and in sequence is therefore no copy.
-        first_port, port_count, received_at = earlier
-        if first_port == number:
-            return is_late and now - received_at <= REPEAT_WINDOW_S
-        existed_then = number <= port_count  # This port already existed when the earlier frame arrived.
-        return first_port in self._ingresses and existed_then and now - received_at <= DUPLICATE_WINDOW_S
+        age_s = now - earlier.received_at
+        if earlier.port_number == number:
+            return is_out_of_order and age_s <= REPEAT_WINDOW_S
+        existed_then = number <= earlier.newest_port
+        return earlier.port_number in self._ingresses and existed_then and age_s <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: FrameRecord, number: int, now: float) -> bool:
         """Return True if an equal frame arrived at another port recently, while port ``number`` already existed."""
-        first_port, port_count, received_at = earlier
-        return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
+        existed_then = number <= earlier.newest_port
+        return earlier.port_number != number and existed_then and now - earlier.received_at <= LOOP_WINDOW_S
 
     def _record_echo(self, ingress: Ingress[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True while a loop is proven."""
@@ -348,25 +350,35 @@ class Router(Generic[PortT]):
 
     def _plan(self, ingress: Ingress[PortT], key: int) -> ForwardingPlan[PortT]:
         """Make the plan for a key of `Ingress.plans`, and cache it."""
+        if len(ingress.plans) >= MAX_PLANS:
+            ingress.forget_plans()
+        plan = self._make_plan(ingress, key)
+        if plan.reason:  # This plan is not cached, because a sender could fill the cache with unknown targets.
+            return plan
+        ingress.plans[key] = plan
+        # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
+        # sender's, may change the data about the sender, so `route` must process them.
+        message_id, source = plan.message_id, key & 0xFFFF
+        if message_id and plan.sender.port_number == ingress.number and self._offsets.get(message_id) is None:
+            ingress.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
+        return plan
+
+    def _make_plan(self, ingress: Ingress[PortT], key: int) -> ForwardingPlan[PortT]:
         message_id, target, source = key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF
-        target_system, target_component = target & 0xFF, target >> 8
-        ids = target_system, target_component
+        ids = system_id, component_id = target & 0xFF, target >> 8
         stream_key = message_id << 16 | source
         sender = self._senders.get(source, _UNKNOWN_SENDER)
         if message_id == _SETUP_SIGNING:
             return ForwardingPlan(stream_key, message_id, ids, reason="secret")
-        has_target = target_system != 0
+        has_target = system_id != 0
         # The keys of the dictionary are used as a set that keeps its order.
+        numbers = dict.fromkeys(self._ingresses)
         if has_target:
-            numbers = self._ports_to(target_system, target_component, source, ingress.number)
+            numbers = self._ports_to(system_id, component_id, source, ingress.number)
             if not numbers:
-                # This plan is not cached, because a sender could fill the cache with unknown targets.
                 return ForwardingPlan(stream_key, message_id, ids, reason="no_route")
-        else:
-            numbers = dict.fromkeys(self._ingresses)
-            if self._targets.is_command(message_id):
-                # An autopilot that is received at two ports gets a command once, and does not get its own command.
-                numbers = {number: None for number in numbers if not self._is_redundant(number, sender)}
+        elif self._targets.is_command(message_id):
+            numbers = {number: None for number in numbers if not self._is_redundant(number, sender)}
         numbers.pop(ingress.number, None)
         # Any autopilot would adapt its message rates to this radio, even if the radio is not its own.
         if message_id in _RADIOS:
@@ -374,35 +386,24 @@ class Router(Generic[PortT]):
         outs, rate_limited = [], []
         for number in numbers:
             port = self._ingresses[number].port
-            period = self._period(port, message_id)
-            if period is None:
+            interval_s = self._min_interval(port, message_id)
+            if interval_s is None:
                 continue
-            if period == 0 or has_target:  # Rate limits do not apply to messages with a target.
+            if interval_s == 0 or has_target:  # Rate limits do not apply to messages with a target.
                 outs.append(port)
             else:
-                rate_limited.append((port, period))
-        if len(ingress.plans) >= MAX_PLANS:
-            ingress.forget_plans()
+                rate_limited.append((port, interval_s))
         # Equal tuples become the same object, so that plans can be compared by identity.
         shared_outs = ingress.destinations.setdefault(tuple(outs), tuple(outs))
-        plan = ForwardingPlan(stream_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
-        ingress.plans[key] = plan
-        # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
-        # sender's, may change the data about the sender, so `route` must process them.
-        if message_id and sender.port_number == ingress.number and self._offsets.get(message_id) is None:
-            ingress.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
-        return plan
+        return ForwardingPlan(stream_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
 
-    def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
-        """Return the numbers of the ports for a frame to a component, or to a whole system (component 0).
-
-        ``here`` is the number of the port that received the frame.
-        """
+    def _ports_to(self, system_id: int, component_id: int, source: int, ingress_number: int) -> dict[int, None]:
+        """Return the numbers of the ports for a frame to a component, or to a whole system (component 0)."""
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None
         if target is not None:
             # A message of a sender to itself would go to the port where it arrived. The caller removes that port.
-            return {here: None} if target is origin else dict.fromkeys(target.destinations)
+            return {ingress_number: None} if target is origin else dict.fromkeys(target.destinations)
         # A message for an unknown component goes to its whole system.
         members = [sender for sender in self._senders.values() if sender.system_id == system_id]
         autopilots = [member for member in members if member.is_autopilot]
@@ -412,7 +413,7 @@ class Router(Generic[PortT]):
             is_reached = member.is_vehicle and any(member.is_at(number) for number in numbers)
             if is_reached:
                 continue
-            destinations = (here,) if member is origin else member.destinations
+            destinations = (ingress_number,) if member is origin else member.destinations
             for number in destinations:
                 # A port at which an autopilot is received is left out for other members. The autopilot would otherwise
                 # get the command twice.
@@ -421,7 +422,7 @@ class Router(Generic[PortT]):
         return numbers
 
     def _is_redundant(self, number: int, sender: Sender) -> bool:
-        """Return True if this port has autopilots, and one is the sender or all get commands through other ports."""
+        """Return True if the autopilots at this port get a broadcast command through other ports, or one sent it."""
         here = [autopilot for autopilot in self._senders.values() if autopilot.is_autopilot and autopilot.is_at(number)]
         return sender in here or (bool(here) and all(autopilot.port_number != number for autopilot in here))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.routes import PEER_TTL_S, ROUTE_TIMEOUT_S, Routes
 from aerokit.events import DuplicateSender, RouteChanged
@@ -67,7 +67,7 @@ class Sender:
         self.system_id: int = source & 0xFF
         self.component_id: int = source >> 8
         self.port_number: int = port_number
-        """Number of the port to which messages for this sender go, if one port is enough."""
+        """Number of the port to which messages for a vehicle go. Messages for a ground station go to all `ports`."""
         self.received_at: float = now
         """Time of the last frame at that port."""
         self.ports: dict[int, float] = {port_number: now}
@@ -83,7 +83,7 @@ class Sender:
         return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if port ``number`` is the sender's port, or if the sender's frames arrive at both ports."""
+        """Return True if frames of the sender arrive at port ``number``, and not only at `port_number`."""
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:
@@ -121,8 +121,13 @@ class Sender:
         return not self.ports
 
 
-FrameRecord = tuple[int, int, float]
-"""Number of the port at which a frame arrived, number of ports created until then, and the time."""
+class FrameRecord(NamedTuple):
+    """Time and port of the arrival of a frame."""
+
+    port_number: int
+    newest_port: int
+    """Number of the port that was created last before the frame arrived. Port numbers increase."""
+    received_at: float
 
 
 class RecentFrames:
@@ -168,7 +173,7 @@ class IdentityGuard:
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
         """Return True if this peer may send this frame.
 
-        Must be called for every heartbeat and, if there are several peers, for every other frame, too.
+        Call it for every heartbeat and, if `has_several_peers` is true, for every other frame.
         """
         if self._routes.arrived_on_other_peer(frame, peer):
             self._current_peer = peer

@@ -46,7 +46,7 @@ class Switch:
         self._clock = self._loop.time
         self._unix_epoch_s = time.time() - self._clock()  # seconds since 1970 at loop time 0
         self._targets = TargetFields(dialect)
-        self.router: Router[Port] = Router(self._targets, lambda port, message_id: port.period(message_id))
+        self.router: Router[Port] = Router(self._targets, lambda port, message_id: port.min_interval(message_id))
         self.router.on_autopilot = _write_single_frames
         self._on_error = on_error
         self._loop_watch = LoopWatch(
@@ -116,24 +116,24 @@ class Switch:
         # Hot path: local variables are faster than attributes.
         ingress, guard, peer = port.ingress, port.guard, port.peer
         if ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
-            if guard is not None:  # The guard still records the ids that each peer uses.
+            if guard is not None:
                 for frame in frames:
-                    guard.admits(frame, framer, peer)
+                    guard.admits(frame, framer, peer)  # called because the guard records the ids of each peer
             port.counters.dropped["read_only"] += len(frames)
             return
-        late = framer.late
+        out_of_order = framer.late
         must_check = port.signer is not None
         if guard is not None and not must_check:
             must_check = guard.has_several_peers or _HEARTBEAT_ID in map(_message_id, frames)
         if must_check:
             received_count = len(frames)
-            frames, late = self._admitted(port, framer, frames)
+            frames, out_of_order = self._admitted(port, framer, frames)
             if port.signer is not None or len(frames) != received_count:
-                data = None  # The bytes as received are no longer those of the frames to forward.
+                data = None  # The received bytes contain more than the frames to forward.
         if now - arrived_at > ORDER_MAX_AGE_S:
             frames = self._without_commands(port, frames, arrived_at)
             data = None
-        plans = self.router.route_all(ingress, frames, arrived_at, late)
+        plans = self.router.route_all(ingress, frames, arrived_at, out_of_order)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
@@ -160,7 +160,7 @@ class Switch:
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
         """Check signatures and ids. Return the accepted frames, and those of them that arrived out of order."""
         admitted: list[Frame] = []
-        late: list[Frame] = []
+        out_of_order: list[Frame] = []
         signer, guard, peer = port.signer, port.guard, port.peer
         for received in frames:
             frame = received if signer is None else signer.verify(received, self.unix_time())
@@ -173,8 +173,8 @@ class Switch:
                 continue
             admitted.append(frame)
             if received in framer.late:
-                late.append(frame)
-        return admitted, late
+                out_of_order.append(frame)
+        return admitted, out_of_order
 
     def _without_commands(self, port: Port, frames: list[Frame], arrived_at: float) -> list[Frame]:
         remaining = []
@@ -209,7 +209,7 @@ class Switch:
             if out.batch:
                 out.batch.append(raw)
             else:
-                self._start_batch(out, raw, plan, now)
+                self._send_or_queue(out, raw, plan, now)
         if plan.rate_limited:
             self._forward_limited(raw, plan, now)
         elif plan.reason:
@@ -217,7 +217,7 @@ class Switch:
         if self.recording is not None and not plan.reason:
             self.recording.write(raw, now)
 
-    def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+    def _send_or_queue(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
         if out.ingress is None:
             return  # The port was removed after the frame was routed.
         if out.must_queue():
@@ -232,12 +232,12 @@ class Switch:
             self._ports_to_flush.append(out)
 
     def _forward_limited(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        for out, period_s in plan.rate_limited:
-            if out.passes_rate_limit(plan.key, period_s, now):
+        for out, interval_s in plan.rate_limited:
+            if out.passes_rate_limit(plan.key, interval_s, now):
                 if out.batch:
                     out.batch.append(raw)
                 else:
-                    self._start_batch(out, raw, plan, now)
+                    self._send_or_queue(out, raw, plan, now)
 
     def _poll(self) -> None:
         now, unix_time = self._clock(), self.unix_time()
