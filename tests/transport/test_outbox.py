@@ -163,7 +163,7 @@ async def test_discarding_is_no_progress() -> None:
         line.outbox.write(b"x" * 10)
         await anyio.sleep(0.2)
         line.pending -= 5
-        line.outbox.record_reclaimed(5)
+        line.outbox.record_discarded(5)
     assert line.events == [True]
 
 

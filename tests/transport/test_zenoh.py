@@ -544,7 +544,7 @@ async def test_notice_for_other_program_is_ignored() -> None:
     link: Any = create_link("zenoh://north/alpha?client=ground")
     link._receiver = recorder = RefusalRecorder()
     for nonce in (link._nonce ^ 1, link._nonce, None):
-        link._on_notice(RefusalNotice("COMMAND_LONG", f"{nonce}", None, nonce=nonce).encode(), b"", True)
+        link._on_notice(RefusalNotice("COMMAND_LONG", f"{nonce}", None, nonce=nonce).encode(), b"")
     assert [reason for _, reason, _ in recorder.refused] == [str(link._nonce), "None"]
 
 

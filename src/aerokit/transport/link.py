@@ -34,13 +34,13 @@ class Receiver(Protocol):
 
 @runtime_checkable
 class DrainListener(Receiver, Protocol):
-    """A receiver that is notified when written data does not leave this machine."""
+    """A receiver that is notified when written data stays in this machine's buffers."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Called when no waiting data has left for a second. Commands in this data may arrive late or never."""
+        """Called when unsent data has waited for a second without progress. Its commands may arrive late or never."""
 
     def link_drained(self, stalled_s: float) -> None:
-        """Called when data leaves again, ``stalled_s`` seconds after `link_stalled`."""
+        """Called when unsent data is sent at last, ``stalled_s`` seconds after `link_stalled`."""
 
 
 @runtime_checkable
@@ -68,10 +68,10 @@ class PeerKeeper(Receiver, Protocol):
 
 @runtime_checkable
 class BurstListener(Receiver, Protocol):
-    """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
+    """A receiver that processes datagrams together if a link has read them at once (see `Link.reports_bursts`)."""
 
     def burst_ended(self) -> None:
-        """Called after the last ``bytes_received`` of a burst."""
+        """Called after the last ``bytes_received`` of datagrams that were read at once."""
 
 
 @runtime_checkable
@@ -234,7 +234,7 @@ class BaseLink(Link):
 
     @abstractmethod
     async def _connect(self) -> None:
-        """Open sockets. An OSError becomes a LinkOpenError. After any failure, `_release` is called."""
+        """Open sockets. `open` raises an OSError as LinkOpenError, and calls `_release` after any failure."""
 
     @abstractmethod
     def _release(self) -> None:

@@ -187,7 +187,7 @@ class MultiLink(Link):
             opening.cancel()
         try:
             await asyncio.wait(openings)
-        finally:  # The caller may be cancelled again; anyio does so at each await.
+        finally:  # The caller may be cancelled in wait(), because anyio cancels each await.
             for link in self._own_links:
                 link.close()
             for member in self._members:
@@ -212,8 +212,7 @@ class MultiLink(Link):
             if error is None:
                 return
             logger.debug("the link still cannot be opened: %s", error)
-            # open() does not report a failure to the receiver, because the connection has no subscribers yet. The
-            # first failed retry is reported instead.
+            # The first failure, in open(), is not reported, because the connection has no subscribers at that time.
             if not is_reported and isinstance(self._receiver, MemberLinkListener):
                 is_reported = True
                 self._receiver.member_link_open_failed(member.index, error)
@@ -285,7 +284,7 @@ class _Member:
         self._is_lost = False
 
     async def open(self) -> LinkOpenError | None:
-        """Open the link. Return the error if another attempt may succeed."""
+        """Open the link. Return an error after which another attempt may succeed, None after a success."""
         receiver = self._owner._receiver
         self.keeps_peers = receiver is not None and keeps_peers(receiver)
         self._is_lost, self.owns_link = False, True

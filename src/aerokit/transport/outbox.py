@@ -99,8 +99,8 @@ class Outbox:
         self._waiting.clear()
         self._waiting_bytes = 0
 
-    def record_reclaimed(self, count: int) -> None:
-        """Record that this many bytes were removed from the transport or the kernel without being sent."""
+    def record_discarded(self, count: int) -> None:
+        """Record that this many bytes were discarded from the transport or the kernel."""
         self._forwarded_bytes -= count
 
     def close(self) -> None:
@@ -163,7 +163,7 @@ class Outbox:
             self._timer = None
 
     def _poll(self) -> None:
-        """Check whether data has left since the last poll."""
+        """Drop outdated writes, and check whether data has left since the last poll."""
         self._timer = None
         self._drop_outdated()
         pending_bytes, now = self._pending(), self._loop.time()

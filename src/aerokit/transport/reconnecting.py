@@ -185,7 +185,7 @@ class ReconnectingLink(Link):
         if current is self._current and self._lost_at is not None:
             self._is_up = True
             self._on_restored()
-        # The callback above may have closed this link.
+        # `link_restored` may have closed this link.
         if current is self._current and self._receiver is not None:
             self._receiver.bytes_received(data, peer)
 
@@ -202,7 +202,7 @@ class ReconnectingLink(Link):
             logger.warning("%s; reopening it", error)
             if isinstance(self._receiver, InterruptionListener):
                 self._receiver.link_interrupted(error)
-        # The callback above may have closed this link.
+        # `link_interrupted` may have closed this link.
         if self._reopening is None and self._receiver is not None:
             self._reopening = asyncio.get_running_loop().create_task(self._reopen(), name="aerokit reopening")
 
@@ -233,8 +233,7 @@ class ReconnectingLink(Link):
             logger.debug("the link still cannot be opened: %s", error)
             return False
         if current.is_lost:  # The new link was lost while it was being opened.
-            # The end of a recording ends this link, too; `_receiver` is then None. After any other loss, another
-            # attempt follows.
+            # If the new link is a recording that has ended, so has this link, and `_receiver` is None.
             return self._receiver is None
         self._is_up = True
         if self._lost_at is not None:

@@ -38,8 +38,7 @@ class Replay(BaseLink):
         self._path, self._speed = path, factor
         self._loop: asyncio.AbstractEventLoop | None = None  # None before the opening
         self._records: Iterator[tuple[float, bytes]] = iter(())
-        # (time stamp, frame); None at the end of the recording.
-        self._next: tuple[float, bytes] | None = None
+        self._next: tuple[float, bytes] | None = None  # (time stamp, frame); None at the end of the recording
         self._due = 0.0  # time of the next frame, on the loop's clock
         self._wake_up: asyncio.Handle | None = None  # pending call of `_play`
 

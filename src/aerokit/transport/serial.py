@@ -2,7 +2,7 @@
 
 Of pyserial-asyncio only the transport is used. The methods of its port are replaced because of these observed problems:
 
-* Closing calls ``tcdrain`` on the event loop: a port with flow control asserted blocks the program.
+* Closing calls ``tcdrain`` on the event loop, which blocks the program while flow control stops the port.
 * pyserial's ``write`` spins while the device accepts nothing; its ``read`` fails above file descriptor 1023.
 * A failed write to an unplugged device is also reported to the loop's exception handler. A failed read is reported only
   after the remaining data has been written.
@@ -83,7 +83,7 @@ class SerialLink(BaseLink):
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
-        self._outbox.record_reclaimed(discarded_bytes)
+        self._outbox.record_discarded(discarded_bytes)
         # It is unknown how many writes these bytes contain, so they count as one dropped write.
         if discarded_bytes > 0:
             self._drop(1)
@@ -131,7 +131,7 @@ class SerialLink(BaseLink):
             raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:
-        # Report the loss in a later loop iteration, because this method may run inside write().
+        # The loss is reported in a later loop iteration, because `write` must not call the receiver.
         if self._loop is not None and self._transport is not None:
             self._transport.pause_reading()
             self._loop.call_soon(self._lose, f"the device failed: {error.strerror or error}", error)
@@ -269,7 +269,7 @@ class PtyLink(BaseLink):
     """One end of a pseudo-terminal. Another program opens the other end; `address` has its name once the link is open.
 
     ``path`` is the name of a symbolic link to the other end, which is removed when this link is closed. A dangling
-    symbolic link of that name is replaced; any other existing file is a LinkOpenError. Baud rates have no effect.
+    symbolic link of that name is replaced; for any other file, `open` raises LinkOpenError. Baud rates have no effect.
     Programs may open and close the other end repeatedly. Unread data stays in the kernel's buffer for the next program;
     further data is dropped while the buffer is full. Not available on Windows.
     """

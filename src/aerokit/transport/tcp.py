@@ -27,8 +27,7 @@ CONNECT_TIMEOUT_S = 10.0
 """Default time-out of `TcpConnect.open`."""
 
 MAX_PENDING_BYTES = 256 * 1024
-"""Size of each connection's write buffer in bytes. Writes that do not fit are dropped, and so are those older than 1 s.
-"""
+"""Size of each connection's write buffer in bytes. Writes that do not fit, or have waited for 1 s, are dropped."""
 
 SEND_BUFFER = 16 * 1024
 """Kernel send buffer (Linux doubles it). The buffer is small because data in it cannot be discarded."""
@@ -41,7 +40,7 @@ NOT_SENT_LOW_WATER = 1024
 ACCEPT_ITERATIONS = 5
 
 MAX_CLIENTS = 64
-"""Maximum number of clients. A further client replaces one that is not kept (`Link.keep_peer`), or is refused."""
+"""Maximum number of clients. Another client replaces a client that is not kept (`Link.keep_peer`), or is refused."""
 
 
 class _TcpLink(BaseLink):
@@ -247,7 +246,7 @@ class TcpListen(_TcpLink):
                 self._receiver.peer_joined(stream.peer)
 
     def _make_room(self) -> bool:
-        """Disconnect a client if there are too many. Return False if no client may be disconnected."""
+        """Disconnect a client if there is no room for another. Return False if no client may be disconnected."""
         if len(self._clients) < MAX_CLIENTS:
             return True
         unkept = next((peer for peer in self._clients if peer not in self._kept), None)

@@ -30,7 +30,7 @@ MAX_BURST_DATAGRAMS = 64
 """Maximum number of datagrams read in one loop iteration, so that other tasks can run."""
 
 MAX_PEERS = 256
-"""Maximum number of peers if the receiver is not a `PeerKeeper`. A new peer replaces the least recent one."""
+"""Maximum number of peers if the receiver is not a `PeerKeeper`. A new peer replaces the peer silent for longest."""
 
 REMOTE_TIMEOUT_S = 3.5
 """A `UdpBroadcast` broadcasts again after this silence of its peer, because the peer's address may have changed."""
@@ -58,8 +58,7 @@ class _UdpLink(BaseLink):
         self._transport: asyncio.DatagramTransport | None = None  # used only on loops without add_reader
         self._transport_owns_socket = False  # True if asyncio reads and closes the socket
         self._has_more: Callable[[], object] = lambda: False  # returns a true value if a datagram can be read
-        # The receiver, if it wants to know when a burst has been read.
-        self._burst_listener: BurstListener | None = None
+        self._burst_listener: BurstListener | None = None  # the receiver, if it is a BurstListener
 
     @property
     def local_address(self) -> tuple[str, int]:
@@ -289,8 +288,7 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         """Return True if datagrams of a sender other than the present peer may be delivered."""
         host, *_ = source
-        # A `PeerKeeper` checks the frames before it calls `keep_peer`. Another port of the same host therefore need not
-        # wait for silence.
+        # Another port of the same host need not wait for silence if a `PeerKeeper` checks its frames.
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 

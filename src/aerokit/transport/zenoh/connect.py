@@ -48,8 +48,8 @@ class ZenohConnect(NetworkLink):
     """``zenoh:`` link: a client of one vehicle side (`ZenohListen`), found by its name.
 
     The link is lost when the vehicle side closes, when it is silent and the network reports it gone, or after
-    `LOST_AFTER_S` of silence. Data written while beacons are missing is dropped, so that no command arrives late
-    (docs/network.md).
+    `LOST_AFTER_S` of silence. Data is dropped if it is written while the beacons of the vehicle side do not arrive, so
+    that no command arrives late (docs/network.md).
 
     Args:
         fleet: name of the fleet, up to 63 letters, digits, ``_``, ``.`` and ``-``.
@@ -99,7 +99,7 @@ class ZenohConnect(NetworkLink):
         return self._tracker.late
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Drops data while beacons are missing."""
+        """See `Link.write`. Drops data while no beacons arrive from the vehicle side."""
         if self._publisher is not None:
             self._put(bytes(data))
 
@@ -124,19 +124,21 @@ class ZenohConnect(NetworkLink):
         """Declare the subscribers, the token and the publisher. Runs on a thread of the executor."""
 
         # The callbacks run on threads of zenoh, so each of them posts its sample to the event loop.
-        # A sample that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
-        def callback_for(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
+        def callback_for(process: Callable[[bytes, bytes], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
-                is_put = sample.kind == zenoh.SampleKind.PUT
                 payload = payload_of(sample)
                 if len(payload) <= MAX_PAYLOAD_BYTES:
-                    queue.post(partial(process, payload, attachment_of(sample), is_put))
+                    queue.post(partial(process, payload, attachment_of(sample)))
 
             return on_sample
 
+        def on_beacon(sample: Any) -> None:
+            is_deleted = sample.kind == zenoh.SampleKind.DELETE  # A vehicle side that closes deletes its beacon.
+            callback_for(self._on_vehicle_side_closed if is_deleted else self._on_beacon)(sample)
+
         def on_liveliness(sample: Any) -> None:
-            is_put = sample.kind == zenoh.SampleKind.PUT
-            queue.post(partial(self._on_liveliness, str(sample.key_expr), is_put))
+            is_alive = sample.kind == zenoh.SampleKind.PUT
+            queue.post(partial(self._on_liveliness, str(sample.key_expr), is_alive))
 
         keys, client = self._keys, self.client
         on_frames = callback_for(self._on_frames)
@@ -145,7 +147,7 @@ class ZenohConnect(NetworkLink):
             session.declare_subscriber(keys.to_all_clients, on_frames),
             session.declare_subscriber(keys.from_vehicle(client), on_frames),
             session.declare_subscriber(keys.notices(client), callback_for(self._on_notice)),
-            session.declare_subscriber(keys.beacon, callback_for(self._on_beacon)),
+            session.declare_subscriber(keys.beacon, on_beacon),
             # The vehicle sides of the whole fleet are tracked, because the error text for a wrong name lists them.
             liveliness.declare_subscriber(KeySpace(keys.fleet, "*").vehicle_token(), on_liveliness, history=True),
             liveliness.declare_token(keys.client_token(client)),
@@ -159,18 +161,18 @@ class ZenohConnect(NetworkLink):
 
     # ---------------------------------------------------------------------------------- receiving
 
-    def _on_frames(self, data: bytes, attachment: bytes, _is_put: bool) -> None:
+    def _on_frames(self, data: bytes, attachment: bytes) -> None:
         sent = SendTime.decode(attachment)
         if sent is not None and self._tracker.accepts(sent, self._now()):
             self._deliver(data)
 
-    def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
-        if not is_put:  # A vehicle side that closes deletes its beacon.
-            sent = SendTime.decode(attachment)
-            if sent is not None and sent.epoch == self._tracker.epoch:
-                self._tracker.reset()
-                self._lose("the vehicle side was closed")
-            return
+    def _on_vehicle_side_closed(self, _data: bytes, attachment: bytes) -> None:
+        sent = SendTime.decode(attachment)
+        if sent is not None and sent.epoch == self._tracker.epoch:
+            self._tracker.reset()
+            self._lose("the vehicle side was closed")
+
+    def _on_beacon(self, data: bytes, _attachment: bytes) -> None:
         beacon = Beacon.decode(data)
         if beacon is None or not self._tracker.receive_beacon(beacon, self._now()):
             return
@@ -178,11 +180,10 @@ class ZenohConnect(NetworkLink):
         if self._tracker.mode == "take":
             if beacon.lease_holder == self.client:
                 self._tracker.mode = "free"
-            # An empty datagram with mode "take" requests control. Once this client has control, a last one is sent with
-            # mode "free".
+            # An empty datagram requests control: with mode "take" until this client has it, then once with "free".
             self._put(b"")
 
-    def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
+    def _on_notice(self, data: bytes, _attachment: bytes) -> None:
         notice = RefusalNotice.decode(data)
         # The nonce tells programs with the same client name apart. A notice without a nonce is for all of them.
         if notice is None or notice.nonce not in (None, self._nonce):
@@ -201,7 +202,7 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- sending
 
     def _put(self, data: bytes) -> None:
-        """Send a datagram to the vehicle side, or drop it while beacons are missing."""
+        """Send a datagram to the vehicle side, or drop it while no beacons arrive from there."""
         stamp = self._tracker.make_stamp(self._now())
         if stamp is None:
             self._drop(1)

@@ -1,7 +1,7 @@
-"""Control of a vehicle that several programs can reach: freshness of datagrams, and the control lease. Sans-IO.
+"""Which of several programs may command a vehicle, and which of their datagrams arrive too late. Sans-IO.
 
-The vehicle side sends numbered beacons. A client stamps each datagram with the number of the last beacon that it
-received. The number shows the maximum age of the datagram: one that a broken connection has delayed has an old number.
+The vehicle side (`ZenohListen`) sends numbered beacons. A client stamps each datagram with the number of the last
+beacon that it received. A datagram that a broken connection has delayed therefore has an old number.
 
 Times are seconds on any monotonic clock.
 """
@@ -114,8 +114,7 @@ class ControlLease:
     """
 
     def __init__(self) -> None:
-        # None if no client has the lease: none had it yet, or it was released or has expired.
-        self._holder: str | None = None
+        self._holder: str | None = None  # None if no client has the lease
         self._received_at = 0.0  # time of the last data of the holder
 
     def holder(self, now: float) -> str | None:
@@ -157,7 +156,7 @@ class ClientFilter:
         self._notices: dict[str, _LastNotice] = {}  # by message name
 
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
-        """Process a fresh datagram. Return the accepted frames, and the notices for the client.
+        """Process a datagram that is not late. Return the accepted frames, and the notices for the client.
 
         ``nonce`` distinguishes programs that use the same client name by mistake.
         """
@@ -284,7 +283,7 @@ _MAX_DRIFT = 0.001  # maximum relative drift of two clocks; quartz clocks are te
 
 
 class FreshnessChecker:
-    """Sends the clock of the vehicle's process in beacons, and refuses datagrams whose stamps are too old."""
+    """Makes the beacons of the vehicle side, and refuses datagrams that are stamped with a beacon that is too old."""
 
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
@@ -304,7 +303,7 @@ class FreshnessChecker:
         return beacon
 
     def is_fresh(self, stamp: Stamp | None, now: float) -> bool:
-        """Return True if a datagram with this stamp is not outdated."""
+        """Return True if the beacon in this stamp is recent."""
         self._expire(now)
         if stamp is not None and stamp.epoch == self.epoch:
             is_fresh = any(beacon.number == stamp.beacon for beacon in self._sent)
