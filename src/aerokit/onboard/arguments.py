@@ -55,7 +55,7 @@ class CommandArgument(Snapshot):
             if self.is_optional and math.isnan(value):  # NaN means that the parameter is missing.
                 return None
             raise InvalidArgument(f"{self.name} = {value} is not allowed: it must be a finite number")
-        # In the texts below, nine digits identify each 32-bit float.
+        # The texts below show nine digits, because fewer would not distinguish all 32-bit floats.
         if not self.range.minimum <= value <= self.range.maximum:
             low, high = self.range.minimum, self.range.maximum
             raise InvalidArgument(f"{self.name} = {value:.9g} is not allowed: it must be {low:g} to {high:g}")

@@ -68,7 +68,7 @@ class AutopilotDriver:
 
 
 def add_autopilot(services: ComponentServices, driver: AutopilotDriver, set_flight_state: Callable[..., None]) -> None:
-    """Serve the commands that ground stations send to a vehicle. See `OnboardComponent._set_flight_state`."""
+    """Serve the commands that ground stations send to a vehicle. ``set_flight_state`` changes the heartbeat."""
 
     async def call(name: str, *arguments: object) -> None:
         if not overrides(driver, AutopilotDriver, name):
@@ -83,7 +83,7 @@ def add_autopilot(services: ComponentServices, driver: AutopilotDriver, set_flig
         set_flight_state(is_armed=is_armed)
 
     async def set_mode(_: CommandRequest, base_mode: int, custom_mode: int) -> None:
-        if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:  # ArduPilot refuses this, too.
+        if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:  # ArduPilot refuses a command without this flag, too.
             raise InvalidArgument(f"base_mode = {base_mode} is not allowed: CUSTOM_MODE_ENABLED (1) must be set")
         await call("set_mode", custom_mode)
         set_flight_state(custom_mode=custom_mode)
@@ -112,7 +112,7 @@ def add_autopilot(services: ComponentServices, driver: AutopilotDriver, set_flig
         return run
 
     add = services.commands.add
-    # Disarming does not wait until an order to arm has been executed.
+    # A command to disarm cancels a running arm() instead of being rejected until arm() has returned.
     add(MavCmd.COMPONENT_ARM_DISARM, arm_disarm, is_stop=lambda command: command.param1 == 0)
     add(MavCmd.DO_SET_MODE, set_mode)
     add(MavCmd.NAV_TAKEOFF, take_off)

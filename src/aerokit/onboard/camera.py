@@ -269,7 +269,7 @@ class CameraAdapter(CameraDevice):
                 time_boot_ms=self._host.time_boot_ms,
                 storage_id=1,
                 storage_count=1,
-                # With NOT_SUPPORTED, clients ignore the sizes.
+                # STORAGE_STATUS has no "not ready". With NOT_SUPPORTED, clients at least ignore the sizes.
                 status=StorageStatus.READY if storage.is_ready else StorageStatus.NOT_SUPPORTED,
                 total_capacity=storage.total_mib,
                 used_capacity=storage.used_mib,
@@ -314,7 +314,7 @@ class CameraAdapter(CameraDevice):
         move_at: Callable[[float], Any],
     ) -> bool:
         """Move the zoom or the focus. Return False if the camera cannot do that."""
-        # SET_FOCUS_TYPE has the same numbers as CAMERA_ZOOM_TYPE.
+        # `kind` is a CAMERA_ZOOM_TYPE, or a SET_FOCUS_TYPE with the same number.
         if kind == CameraZoomType.STEP and math.isfinite(current_percent) and math.isfinite(value):
             kind = CameraZoomType.RANGE
             value = max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))

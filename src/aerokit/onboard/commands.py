@@ -273,7 +273,7 @@ class _Execution:
     def cancel(self) -> bool:
         """Cancel the handler. Return False if it runs in a thread, which cannot be cancelled."""
         if self._task in self._commands._tasks_in_threads:
-            return False  # The sender gets the result.
+            return False  # The sender gets the result of the thread.
         if self._task is not None:
             self._task.cancel()
         elif not self._is_cancelled:

@@ -100,10 +100,10 @@ class OnboardComponent:
         try:
             await self._tasks.aclose()
         finally:
-            # Nothing could stop a motion, or save a parameter, that arrives after the next lines.
+            # Commands must not arrive after this line, because nothing would stop their motions or save their changes.
             self._host.stop_receiving()
             try:
-                await run_shielded(self._stop_and_save())  # A cancelled program must stop and save, too.
+                await run_shielded(self._stop_and_save())
             finally:
                 self._commands.close()
                 self._ftp.close()

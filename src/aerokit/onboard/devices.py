@@ -106,8 +106,8 @@ STATUS_HZ = 5.0
 
 
 def _check_instance(services: ComponentServices, instance: float | None) -> None:
-    # A command that was sent to all components arrives here, too. A device is number 1 or the component id, and 0 means
-    # all devices (DO_GRIPPER in common.xml).
+    # A command to all components may be meant for another one. Our only device has number 1, or the number of the
+    # component id, and 0 means all devices (DO_GRIPPER in common.xml).
     if instance not in (None, 0, 1, services.host.component_id):
         raise InvalidArgument(f"instance = {instance} is not allowed: this component has only number 1")
 
@@ -121,16 +121,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         method = _WINCH_METHODS.get(action, "")
         if not method or not overrides(winch, WinchDriver, method):
             raise NotSupported(f"this winch does not support action {action}")
-        arguments: tuple[float | None, ...] = ()
-        if method == "pay_out":
-            arguments = (length, rate)
-        elif method == "set_rate":
-            arguments = (rate,)
-        if None in arguments:  # A parameter that the sender has left out is NaN, and arrives here as None.
-            needed = "length and rate" if method == "pay_out" else "rate"
-            raise InvalidArgument(f"this action needs {needed}; NaN is not allowed")
-        if method == "pay_out" and rate is not None and rate <= 0:
-            raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
+        arguments = _winch_arguments(method, length, rate)
         if method == "set_rate":
             can_hold = overrides(winch, WinchDriver, "hold")
             services.stop_functions["winch"] = winch.hold if can_hold else partial(winch.set_rate, 0.0)
@@ -151,6 +142,21 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     services.add_message(m.WinchStatus, status, STATUS_HZ)
 
 
+def _winch_arguments(method: str, length: float | None, rate: float | None) -> tuple[float, ...]:
+    # A parameter that the sender has left out is NaN in the message, and None here.
+    if method == "pay_out":
+        if length is None or rate is None:
+            raise InvalidArgument("this action needs length and rate; NaN is not allowed")
+        if rate <= 0:
+            raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
+        return length, rate
+    if method == "set_rate":
+        if rate is None:
+            raise InvalidArgument("this action needs rate; NaN is not allowed")
+        return (rate,)
+    return ()
+
+
 def add_gripper(
     services: ComponentServices, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]
 ) -> None:
@@ -168,11 +174,6 @@ def add_gripper(
 
 
 def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> None:
-    """Answer ARM_AUTHORIZATION_REQUEST.
-
-    ``authorize`` returns the seconds for which arming is allowed, or a CommandResult. An error denies arming.
-    """
-
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).

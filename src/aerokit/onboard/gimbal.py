@@ -167,11 +167,11 @@ class GimbalAdapter(GimbalMount):
         self._record(flags, is_yaw_locked=target.yaw_locked)
 
     def _record(self, flags: int, *, is_yaw_locked: bool) -> None:
-        # The motion is forgotten only here: if the program's method raised an exception, the gimbal may still turn.
+        # Called after the program's method has returned. If it raises an exception instead, the gimbal may still turn.
         self._stop_functions.pop("gimbal", None)
         self.flags: int = flags
         self._is_yaw_locked = is_yaw_locked
-        self._followed_system_id = 0  # A newer command ends the following.
+        self._followed_system_id = 0  # A new target ends the following of a system.
 
     def look_at(self, place: Place | None) -> None:
         position = None

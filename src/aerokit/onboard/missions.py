@@ -146,7 +146,7 @@ class ComponentMissions:
 
     async def _do_set_current(self, _: CommandRequest, index: int) -> None:
         is_known = 0 <= index < len(self.items())
-        # A coroutine, because the program's function may run in a thread, which must not send.
+        # This coroutine runs on the event loop, so it may send. The program's function may run in a thread.
         if not is_known or self._on_current is None or await self._commands.call(self._on_current, index) is False:
             raise InvalidArgument(f"the mission cannot continue at item {index}")
         self.set_current(index)

@@ -223,7 +223,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             while self._is_dirty:
                 self._is_dirty = False
                 write = partial(write_atomically, path, self._file_text())
-                # Memory cards are slow.
+                # A thread writes the file, because memory cards are slow.
                 await asyncio.get_running_loop().run_in_executor(None, write)
         except OSError as error:
             self._is_dirty = True
@@ -292,7 +292,7 @@ class _Store:
 
 
 def _rounded_limit(limit: float | None, default: ParameterValue) -> float | None:
-    # Values are rounded to 32 bits. If the limit was not rounded, too, a value at the limit could be refused.
+    # Values are rounded to 32 bits, and so are limits. Otherwise a value at the limit could be refused.
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 

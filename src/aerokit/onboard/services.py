@@ -41,7 +41,7 @@ class ComponentServices:
         self.commands.add_guarded(self.streams.commands())
         self.memory: FileTree = FileTree()
         self.stop_functions: dict[str, Callable[[], Any]] = {}
-        """Functions of the program that stop a motion, by the name of the part that moves until the next command."""
+        """Maps the name of a moving part, e.g. "winch", to the program's function that stops it."""
 
     async def stop_motions(self) -> None:
         thread_calls = set(self.commands.thread_calls)
@@ -57,7 +57,7 @@ class ComponentServices:
             try:
                 with anyio.fail_after(STOP_TIMEOUT_S):
                     await self.commands.call(stop)
-            except (Exception, asyncio.CancelledError) as error:  # A driver may await a task that it has cancelled.
+            except (Exception, asyncio.CancelledError) as error:  # e.g. the driver awaits a task that it has cancelled
                 self.host.report_error(f"stopping the {part}", error)
 
     def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:
