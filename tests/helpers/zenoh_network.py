@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import anyio
 from free_ports import free_port
 
-__all__ = ["VEHICLE_SIDE", "HoldingProxy", "eventually", "process", "router"]
+__all__ = ["SERVER", "HoldingProxy", "eventually", "process", "router"]
 
 ROUTER = """
 import json, sys, zenoh
@@ -22,7 +22,7 @@ session = zenoh.open(config)
 print("up", flush=True)
 sys.stdin.read()
 """
-VEHICLE_SIDE = """
+SERVER = """
 import asyncio, sys
 from aerokit.transport import create_link
 from aerokit.mavlink.encoder import FrameEncoder

@@ -16,7 +16,7 @@ from aerokit.transport.zenoh.control_lease import (
     MAX_DELAY_S,
     DelayEstimator,
     FreshnessChecker,
-    VehicleSideTracker,
+    ServerTracker,
 )
 from aerokit.transport.zenoh.keys import Beacon, SendTime, Stamp
 
@@ -29,7 +29,7 @@ holds = st.lists(st.tuples(st.floats(0, 12), st.floats(0, 10)), max_size=3)  # b
 
 
 class SimulatedNetwork:
-    """A vehicle side that sends beacons, a client that sends continuously, and a network with arbitrary delays."""
+    """A server that sends beacons, a client that sends continuously, and a network with arbitrary delays."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class SimulatedNetwork:
         delays: Iterator[float],
         holds: Holds = ((), ()),
     ) -> None:
-        self.checker, self.tracker = FreshnessChecker(7), VehicleSideTracker(1)
+        self.checker, self.tracker = FreshnessChecker(7), ServerTracker(1)
         self.vehicle_clock, self.client_clock = vehicle, client
         self.delays, self.holds = delays, holds
         self.events: list[Event] = []
@@ -126,7 +126,7 @@ def test_working_network_accepts_everything(
 
 
 def test_nothing_is_sent_in_silence_and_held_back_refused() -> None:
-    checker, tracker = FreshnessChecker(7), VehicleSideTracker(1)
+    checker, tracker = FreshnessChecker(7), ServerTracker(1)
     assert tracker.make_stamp(0.0) is None  # no beacon was received
     assert tracker.receive_beacon(checker.make_beacon(100.0), 0.0)
     held = tracker.make_stamp(1.9)
@@ -145,8 +145,8 @@ def test_nothing_is_sent_in_silence_and_held_back_refused() -> None:
     assert checker.duplicates == 1
 
 
-def test_second_vehicle_side_with_same_name() -> None:
-    first, second, tracker = FreshnessChecker(1), FreshnessChecker(2), VehicleSideTracker(1)
+def test_second_server_with_same_name() -> None:
+    first, second, tracker = FreshnessChecker(1), FreshnessChecker(2), ServerTracker(1)
     assert tracker.receive_beacon(first.make_beacon(0.0), 0.0)
     assert not tracker.receive_beacon(second.make_beacon(50.0), 0.1)  # the first one is active
     assert not tracker.accepts(SendTime(2, 50.0), 0.1)
@@ -201,7 +201,7 @@ def test_delay_after_a_faster_datagram() -> None:
 
 
 def test_overtaken_beacon_is_ignored() -> None:
-    tracker = VehicleSideTracker(1)
+    tracker = ServerTracker(1)
     assert tracker.receive_beacon(Beacon(7, 2, 1.0), 1.0)
     assert not tracker.receive_beacon(Beacon(7, 1, 0.5), 1.1)
     assert not tracker.receive_beacon(Beacon(7, 2, 1.0), 1.2)

@@ -15,7 +15,7 @@ import pytest
 from free_ports import free_port
 from link_harness import Recorder, each_loop
 from zenoh_harness import RefusalRecorder, client, reconnecting, serving, until_open_error
-from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, process, router
+from zenoh_network import SERVER, HoldingProxy, eventually, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.mavlink.encoder import FrameEncoder
@@ -81,12 +81,12 @@ async def test_only_complete_frames_of_a_client_pass() -> None:
         assert recorder.data == last
 
 
-async def test_closed_vehicle_side_is_a_lost_link() -> None:
+async def test_closed_server_is_a_lost_link() -> None:
     port = free_port()
     async with serving(port) as (vehicle, _), client(port) as (_link, answered):
         vehicle.close()
         await eventually(lambda: bool(answered.losses))
-        assert "the vehicle side was closed" in str(answered.losses[0])
+        assert "the server was closed" in str(answered.losses[0])
 
 
 async def test_unknown_name() -> None:
@@ -94,7 +94,7 @@ async def test_unknown_name() -> None:
     address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}"
     with router(port):
         async with serving(port, "beta", "connect"), serving(port, "gamma", "connect"):
-            await until_open_error(address, r"no vehicle side named alpha .*available: beta, gamma")
+            await until_open_error(address, r"no server named alpha .*available: beta, gamma")
         await until_open_error(address, "the fleet is empty")
 
 
@@ -225,20 +225,20 @@ async def test_killed_router_returns() -> None:
 
 
 @pytest.mark.exhaustive
-async def test_killed_vehicle_side_is_replaced() -> None:
+async def test_killed_server_is_replaced() -> None:
     port = free_port()
     address = f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}"
-    with router(port), process(VEHICLE_SIDE, address) as first:
+    with router(port), process(SERVER, address) as first:
         async with reconnecting(port) as (_, client_recorder):
             await eventually(lambda: client_recorder.data != b"")
             first.kill()
             await eventually(lambda: client_recorder.interruptions >= 1)
             client_recorder.pieces.clear()
-            with process(VEHICLE_SIDE, address):
+            with process(SERVER, address):
                 await eventually(lambda: client_recorder.restored >= 1 and client_recorder.data != b"")
 
 
-async def test_late_client_finds_vehicle_side_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_late_client_finds_server_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The next beacon is disabled."""
     port = free_port()
     monkeypatch.setattr(zenoh_listen, "BEACON_INTERVAL_S", 3600.0)
@@ -330,7 +330,7 @@ async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
         await received.until_data(order)
         assert received.peers == ["ground-1"]
         address = f"zenoh://north/beta?config={files['onlooker']}"
-        await until_open_error(address, r"no vehicle side named beta in the fleet north \(available: alpha\)")
+        await until_open_error(address, r"no server named beta in the fleet north \(available: alpha\)")
         for link, _ in opened:
             link.close()
         for link, _ in opened:
@@ -477,8 +477,8 @@ async def test_payload_larger_than_datagram_is_ignored() -> None:
         stamp, sent = link._tracker.make_stamp(link._now()), SendTime(vehicle._freshness.epoch, vehicle._now()).encode()
         assert stamp is not None
         for session, key, attachment in (
-            (link._session, link._keys.to_vehicle("ground"), stamp.encode()),
-            (vehicle._session, vehicle._keys.from_vehicle("ground"), sent),
+            (link._session, link._keys.to_server("ground"), stamp.encode()),
+            (vehicle._session, vehicle._keys.from_server("ground"), sent),
         ):  # blocks until it is sent; the small ones arrive after it
             session.put(key, order * 10_000, attachment=attachment, congestion_control=CongestionControl.BLOCK)
 

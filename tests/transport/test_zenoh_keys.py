@@ -23,8 +23,8 @@ names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}", fullmatch=True)
 def test_keys() -> None:
     keys = KeySpace("north", "alpha")
     assert keys.to_all_clients == "aerokit/north/alpha/from/all"
-    assert keys.to_vehicle("ground") == "aerokit/north/alpha/to/ground"
-    assert keys.vehicle_token(255) == "aerokit/north/alpha/alive/000000ff"
+    assert keys.to_server("ground") == "aerokit/north/alpha/to/ground"
+    assert keys.server_token(255) == "aerokit/north/alpha/alive/000000ff"
     assert keys.state("1/position") == "aerokit/north/alpha/state/1/position"
 
 

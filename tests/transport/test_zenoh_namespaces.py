@@ -119,7 +119,7 @@ def test_unplugged_cable(machines: tuple[str, str]) -> None:
     with Program(one, VEHICLE) as vehicle, Program(two, CLIENT) as client:
 
         def received() -> int:
-            """Return the number of datagrams that the vehicle side reported since the last call; update ``late``."""
+            """Return the number of datagrams that the server reported since the last call; update ``late``."""
             nonlocal late
             line, count = vehicle.ask("late?"), 0
             while line.startswith("received"):

@@ -38,7 +38,7 @@ class RefusalRecorder(Recorder):
 
 @contextlib.asynccontextmanager
 async def serving(port: int, name: str = "alpha", how: str = "listen") -> AsyncIterator[tuple[ZenohListen, Recorder]]:
-    """A vehicle side that listens on a port, or connects to it."""
+    """A server that listens on a port, or connects to it."""
     link = create_link(f"zenohin://north/{name}?{how}=tcp/127.0.0.1:{port}")
     assert isinstance(link, ZenohListen)
     recorder = Recorder()

@@ -121,7 +121,7 @@ async def discover(
             else:
                 keys.discard(key)
 
-        all_names = KeySpace(fleet, "*").vehicle_token()
+        all_names = KeySpace(fleet, "*").server_token()
         subscribers.append(session.liveliness().declare_subscriber(all_names, on_sample, history=True))
 
     options = NetworkOptions(tuple(connect), tuple(listen), "", config)

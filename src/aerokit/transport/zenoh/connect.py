@@ -15,7 +15,7 @@ import anyio
 
 from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.transport.link import OrderRefusalListener, Peer
-from aerokit.transport.zenoh.control_lease import VehicleSideTracker, rejection_frames
+from aerokit.transport.zenoh.control_lease import ServerTracker, rejection_frames
 from aerokit.transport.zenoh.keys import (
     CONTROL_MODES,
     Beacon,
@@ -39,26 +39,26 @@ OPEN_TIMEOUT_S = 5.0
 """Default time-out of `ZenohConnect.open`."""
 
 LOST_AFTER_S = 15.0
-"""The vehicle side counts as lost after this silence, even if the network still reports it as alive."""
+"""The server counts as lost after this silence, even if the network still reports it as alive."""
 
 _POLL_INTERVAL_S = 0.25
 
 
 class ZenohConnect(NetworkLink):
-    """``zenoh:`` link: a client of one vehicle side (`ZenohListen`), found by its name.
+    """``zenoh:`` link: a client of one server (`ZenohListen`), found by its name.
 
-    The link is lost when the vehicle side closes, when it is silent and the network reports it gone, or after
-    `LOST_AFTER_S` of silence. Data is dropped if it is written while the beacons of the vehicle side do not arrive, so
-    that no command arrives late (docs/network.md).
+    The link is lost when the server closes, when it is silent and the network reports it gone, or after
+    `LOST_AFTER_S` of silence. Data that is written while no beacons arrive from the server is dropped, so that no
+    command arrives late (docs/network.md).
 
     Args:
         fleet: name of the fleet, up to 63 letters, digits, ``_``, ``.`` and ``-``.
-        name: name of the vehicle side in the fleet.
+        name: name of the server in the fleet.
         options: connection to the network.
         client: name of this program, unique on the network; "": the name of this computer and a number.
         control: "free" acquires control with the first command, if no other client has it. "take" takes control when
             the link opens. "never" is read only.
-        open_timeout_s: time-out for finding the vehicle side, above 0.
+        open_timeout_s: time-out for finding the server, above 0.
 
     Raises:
         InvalidArgument: an argument is wrong.
@@ -83,14 +83,14 @@ class ZenohConnect(NetworkLink):
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
         self._nonce = random.getrandbits(32)  # distinguishes this link from others that use the same client name
-        self._tracker = VehicleSideTracker(self._nonce, control)
-        self._vehicle_tokens: set[str] = set()  # keys of the vehicle sides that are alive, as reported by the network
+        self._tracker = ServerTracker(self._nonce, control)
+        self._server_tokens: set[str] = set()  # keys of the servers that are alive, as reported by the network
         self._publisher: Any = None  # None while the link is not open
-        self._first_beacon = asyncio.Event()  # set once the vehicle side was found
+        self._first_beacon = asyncio.Event()  # set once the server was found
 
     @property
     def lease_holder(self) -> str | None:
-        """Client that has control, as last reported by the vehicle side; None: free."""
+        """Client that has control, as last reported by the server; None: free."""
         return self._tracker.lease_holder
 
     @property
@@ -99,7 +99,7 @@ class ZenohConnect(NetworkLink):
         return self._tracker.late
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`. Drops data while no beacons arrive from the vehicle side."""
+        """See `Link.write`. Drops data while no beacons arrive from the server."""
         if self._publisher is not None:
             self._put(bytes(data))
 
@@ -133,8 +133,8 @@ class ZenohConnect(NetworkLink):
             return on_sample
 
         def on_beacon(sample: Any) -> None:
-            is_deleted = sample.kind == zenoh.SampleKind.DELETE  # A vehicle side that closes deletes its beacon.
-            callback_for(self._on_vehicle_side_closed if is_deleted else self._on_beacon)(sample)
+            is_deleted = sample.kind == zenoh.SampleKind.DELETE  # A server that closes deletes its beacon.
+            callback_for(self._on_server_closed if is_deleted else self._on_beacon)(sample)
 
         def on_liveliness(sample: Any) -> None:
             is_alive = sample.kind == zenoh.SampleKind.PUT
@@ -145,14 +145,14 @@ class ZenohConnect(NetworkLink):
         liveliness = session.liveliness()
         declared = [
             session.declare_subscriber(keys.to_all_clients, on_frames),
-            session.declare_subscriber(keys.from_vehicle(client), on_frames),
+            session.declare_subscriber(keys.from_server(client), on_frames),
             session.declare_subscriber(keys.notices(client), callback_for(self._on_notice)),
             session.declare_subscriber(keys.beacon, on_beacon),
-            # The vehicle sides of the whole fleet are tracked, because the error text for a wrong name lists them.
-            liveliness.declare_subscriber(KeySpace(keys.fleet, "*").vehicle_token(), on_liveliness, history=True),
+            # The servers of the whole fleet are tracked, because the error text for a wrong name lists them.
+            liveliness.declare_subscriber(KeySpace(keys.fleet, "*").server_token(), on_liveliness, history=True),
             liveliness.declare_token(keys.client_token(client)),
         ]
-        publisher = session.declare_publisher(keys.to_vehicle(client), congestion_control=zenoh.CongestionControl.DROP)
+        publisher = session.declare_publisher(keys.to_server(client), congestion_control=zenoh.CongestionControl.DROP)
         if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
             self._declared, self._publisher = declared, publisher
 
@@ -166,11 +166,11 @@ class ZenohConnect(NetworkLink):
         if sent is not None and self._tracker.accepts(sent, self._now()):
             self._deliver(data)
 
-    def _on_vehicle_side_closed(self, _data: bytes, attachment: bytes) -> None:
+    def _on_server_closed(self, _data: bytes, attachment: bytes) -> None:
         sent = SendTime.decode(attachment)
         if sent is not None and sent.epoch == self._tracker.epoch:
             self._tracker.reset()
-            self._lose("the vehicle side was closed")
+            self._lose("the server was closed")
 
     def _on_beacon(self, data: bytes, _attachment: bytes) -> None:
         beacon = Beacon.decode(data)
@@ -195,14 +195,14 @@ class ZenohConnect(NetworkLink):
 
     def _on_liveliness(self, key: str, is_alive: bool) -> None:
         if is_alive:
-            self._vehicle_tokens.add(key)
+            self._server_tokens.add(key)
         else:
-            self._vehicle_tokens.discard(key)
+            self._server_tokens.discard(key)
 
     # ---------------------------------------------------------------------------------- sending
 
     def _put(self, data: bytes) -> None:
-        """Send a datagram to the vehicle side, or drop it while no beacons arrive from there."""
+        """Send a datagram to the server, or drop it while no beacons arrive from there."""
         stamp = self._tracker.make_stamp(self._now())
         if stamp is None:
             self._drop(1)
@@ -221,21 +221,21 @@ class ZenohConnect(NetworkLink):
         tracker, now = self._tracker, self._now()
         if tracker.epoch is not None and tracker.is_silent(now):
             # The end of the liveliness token shows a loss earlier than a long silence does.
-            if self._keys.vehicle_token(tracker.epoch) not in self._vehicle_tokens:
-                self._lose("the vehicle side has left the network")
+            if self._keys.server_token(tracker.epoch) not in self._server_tokens:
+                self._lose("the server has left the network")
                 return
             if now - tracker.received_at > LOST_AFTER_S:
-                self._lose(f"nothing was received from the vehicle side for {LOST_AFTER_S:g} s")
+                self._lose(f"nothing was received from the server for {LOST_AFTER_S:g} s")
                 return
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        names = sorted({key.split("/")[2] for key in self._vehicle_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
+        names = sorted({key.split("/")[2] for key in self._server_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:
             return f"{keys.name} is on the network, but sent nothing for {self._open_timeout_s:g} s"
         hint = f" (available: {', '.join(names)})" if names else " (the fleet is empty)"
-        return f"no vehicle side named {keys.name} in the fleet {keys.fleet}{hint}"
+        return f"no server named {keys.name} in the fleet {keys.fleet}{hint}"
 
 
 def _own_name() -> str:

@@ -1,6 +1,6 @@
 """Which of several programs may command a vehicle, and which of their datagrams arrive too late. Sans-IO.
 
-The vehicle side (`ZenohListen`) sends numbered beacons. A client stamps each datagram with the number of the last
+The server (`ZenohListen`) sends numbered beacons. A client stamps each datagram with the number of the last
 beacon that it received. A datagram that a broken connection has delayed therefore has an old number.
 
 Times are seconds on any monotonic clock.
@@ -283,12 +283,12 @@ _MAX_DRIFT = 0.001  # maximum relative drift of two clocks; quartz clocks are te
 
 
 class FreshnessChecker:
-    """Makes the beacons of the vehicle side, and refuses datagrams that are stamped with a beacon that is too old."""
+    """Used by the server: makes its beacons, and refuses datagrams that are stamped with a beacon that is too old."""
 
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
         self.late: int = 0
-        """Datagrams refused because their stamp was too old, invalid, missing, or for another vehicle side."""
+        """Datagrams refused because their stamp was too old, invalid, missing, or for another server."""
         self.duplicates: int = 0
         """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0  # number of the last beacon
@@ -355,18 +355,18 @@ class DelayEstimator:
         return 0.0
 
 
-class VehicleSideTracker:
-    """Used by clients: tracks the vehicle side, i.e. the program that serves the vehicle, and stamps datagrams."""
+class ServerTracker:
+    """Used by clients: tracks the server, and stamps datagrams with its last beacon."""
 
     def __init__(self, nonce: int, mode: ControlMode = "free") -> None:
         self.epoch: int | None = None
-        """Epoch of the tracked vehicle side; None before the first beacon."""
+        """Epoch of the tracked server; None before the first beacon."""
         self.lease_holder: str | None = None
         """Client that holds the control lease according to the last beacon; None: free."""
         self.late: int = 0
         """Number of datagrams and beacons dropped because they arrived too late."""
         self.foreign: int = 0
-        """Number of datagrams and beacons dropped because another vehicle side with the same name sent them."""
+        """Number of datagrams and beacons dropped because another server with the same name sent them."""
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
         self.mode: ControlMode = mode
@@ -379,7 +379,7 @@ class VehicleSideTracker:
     def receive_beacon(self, beacon: Beacon, now: float) -> bool:
         """Record a beacon. Return False for a beacon that is ignored.
 
-        A beacon is ignored if it is late, if a newer one was already received, or if another vehicle side has sent it.
+        A beacon is ignored if it is late, if a newer one was already received, or if another server has sent it.
         """
         if beacon.epoch != self.epoch:
             if self.epoch is not None and not self.is_silent(now):
@@ -399,7 +399,7 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, sent: SendTime, now: float) -> bool:
-        """Return True if a datagram is on time and from the tracked vehicle side."""
+        """Return True if a datagram is on time and from the tracked server."""
         if sent.epoch != self.epoch:
             self.foreign += 1
             return False
@@ -409,7 +409,7 @@ class VehicleSideTracker:
         return True
 
     def make_stamp(self, now: float) -> Stamp | None:
-        """Make the stamp for a datagram. None means that nothing may be sent, because beacons are missing."""
+        """Return a stamp for a datagram; None if no datagram may be sent, because no beacon arrived recently."""
         if self.epoch is None or self.is_silent(now):
             return None
         self._sequence += 1

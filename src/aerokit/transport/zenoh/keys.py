@@ -1,12 +1,12 @@
-"""Keys and messages between a vehicle side and its clients on a zenoh network.
+"""Keys and messages between a server and its clients on a zenoh network.
 
 ```text
-aerokit/FLEET/NAME/from/all      frames of the vehicle side to all clients (read access)
-aerokit/FLEET/NAME/from/CLIENT   frames of the vehicle side to one client
-aerokit/FLEET/NAME/beacon        JSON, twice a second: the vehicle side's clock, and the client that has control
+aerokit/FLEET/NAME/from/all      frames of the server to all clients (read access)
+aerokit/FLEET/NAME/from/CLIENT   frames of the server to one client
+aerokit/FLEET/NAME/beacon        JSON, twice a second: the server's clock, and the client that has control
 aerokit/FLEET/NAME/refused/CLIENT   JSON: a command of this client was refused
-aerokit/FLEET/NAME/to/CLIENT     frames of one client to the vehicle side (write access)
-aerokit/FLEET/NAME/alive/EPOCH   liveliness token of a vehicle side
+aerokit/FLEET/NAME/to/CLIENT     frames of one client to the server (write access)
+aerokit/FLEET/NAME/alive/EPOCH   liveliness token of a server
 aerokit/FLEET/NAME/client/CLIENT liveliness token of a client
 aerokit/FLEET/NAME/state/1/STATE JSON: typed state of the vehicle with this system id, for programs in other languages
 ```
@@ -54,7 +54,7 @@ def check_name(argument: str, name: str) -> str:
 
 
 class KeySpace(Snapshot):
-    """Zenoh keys that the vehicle side ``name`` in the fleet ``fleet`` and its clients use."""
+    """Zenoh keys that the server ``name`` in the fleet ``fleet`` and its clients use."""
 
     fleet: str
     name: str
@@ -65,22 +65,22 @@ class KeySpace(Snapshot):
 
     @property
     def to_all_clients(self) -> str:
-        return self.from_vehicle(_ALL_CLIENTS)
+        return self.from_server(_ALL_CLIENTS)
 
     @property
     def beacon(self) -> str:
         return f"{self.root}/beacon"
 
-    def from_vehicle(self, client: str) -> str:
+    def from_server(self, client: str) -> str:
         return f"{self.root}/from/{client}"
 
-    def to_vehicle(self, client: str = "*") -> str:
+    def to_server(self, client: str = "*") -> str:
         return f"{self.root}/to/{client}"
 
     def notices(self, client: str) -> str:
         return f"{self.root}/refused/{client}"
 
-    def vehicle_token(self, epoch: int | None = None) -> str:
+    def server_token(self, epoch: int | None = None) -> str:
         """Return the key of a liveliness token. Without an epoch, it is a pattern for all runs."""
         return f"{self.root}/alive/{'*' if epoch is None else format(epoch, '08x')}"
 
@@ -96,11 +96,11 @@ class Beacon(Snapshot):
     """Message that the process beside the vehicle sends twice a second, with the time of its clock."""
 
     epoch: int
-    """Random number of this run of the vehicle side."""
+    """Random number of this run of the server."""
     number: int
     """Number of this beacon, counted from 1."""
     clock_s: float
-    """Time on the vehicle side's clock, in seconds."""
+    """Time on the server's clock, in seconds."""
     lease_holder: str | None = None
     """Client that has control; None if no client has it."""
 
@@ -146,7 +146,7 @@ class Stamp(Snapshot):
 
 
 class RefusalNotice(Snapshot):
-    """Message from a vehicle side to a client whose command it refused."""
+    """Message from a server to a client whose command it refused."""
 
     message: str
     """Name of the MAVLink message, e.g. "COMMAND_LONG"."""
@@ -198,7 +198,7 @@ class RefusalNotice(Snapshot):
 
 
 class SendTime(Snapshot):
-    """Zenoh attachment of each datagram from the vehicle side."""
+    """Zenoh attachment of each datagram from the server."""
 
     epoch: int
     clock_s: float

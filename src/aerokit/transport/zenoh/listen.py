@@ -1,4 +1,4 @@
-"""``zenohin:`` link: the vehicle side, which serves clients on a zenoh network under a name."""
+"""``zenohin:`` link: a server for clients on a zenoh network, which find it by its name."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ZenohListen(NetworkLink):
 
     Args:
         fleet: name of the fleet, up to 63 letters, digits, ``_``, ``.`` and ``-``.
-        name: unique name of this vehicle side in the fleet.
+        name: unique name of this server in the fleet.
         options: connection to the network.
 
     Raises:
@@ -73,7 +73,7 @@ class ZenohListen(NetworkLink):
         self._publisher: Any = None  # sends to all clients; None while the link is not open
         self._may_have_conflict = False  # True if a liveliness token shows that the name may be in use
         self._is_serving = False  # True while clients are served
-        self._name_conflict = asyncio.Event()  # set when another vehicle side sends a beacon under this name
+        self._name_conflict = asyncio.Event()  # set when another server sends a beacon under this name
         self._beacon_at = 0.0  # time of the last own beacon
 
     @property
@@ -104,7 +104,7 @@ class ZenohListen(NetworkLink):
         if peer is None:
             self._put_or_drop(lambda: self._publisher.put(bytes(data), attachment=attachment))
         elif peer in self._clients:
-            self._put(self._keys.from_vehicle(str(peer)), bytes(data), attachment)
+            self._put(self._keys.from_server(str(peer)), bytes(data), attachment)
         else:
             self._drop(1)
 
@@ -140,7 +140,7 @@ class ZenohListen(NetworkLink):
         declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
         # A token alone does not prove that the name is in use, because the token of a killed program remains for a
         # while. A beacon proves it.
-        tokens = session.liveliness().get(self._keys.vehicle_token(), timeout=_TOKEN_QUERY_TIMEOUT_S)
+        tokens = session.liveliness().get(self._keys.server_token(), timeout=_TOKEN_QUERY_TIMEOUT_S)
         may_have_conflict = bool(list(tokens))
         if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
             self._declared, self._may_have_conflict = declared, may_have_conflict
@@ -162,9 +162,9 @@ class ZenohListen(NetworkLink):
         liveliness = session.liveliness()
         publisher = session.declare_publisher(keys.to_all_clients, congestion_control=zenoh.CongestionControl.DROP)
         declared = [
-            session.declare_subscriber(keys.to_vehicle(), on_datagram),
+            session.declare_subscriber(keys.to_server(), on_datagram),
             liveliness.declare_subscriber(keys.client_token(), on_liveliness, history=True),
-            liveliness.declare_token(keys.vehicle_token(self._freshness.epoch)),
+            liveliness.declare_token(keys.server_token(self._freshness.epoch)),
         ]
         if queue is self._queue:  # See `_find_conflict`.
             self._publisher = publisher
@@ -175,7 +175,7 @@ class ZenohListen(NetworkLink):
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            # The deletion of the beacon, with a send time of 0, tells clients that the vehicle side was closed.
+            # The deletion of the beacon, with a send time of 0, tells clients that the server was closed.
             goodbye = SendTime(self._freshness.epoch, 0.0).encode()
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
