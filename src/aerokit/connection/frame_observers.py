@@ -237,12 +237,6 @@ class FrameObservers:
                 logger.exception("frame observer %r raised an exception; the frame was sent", observer)
 
     def record(self, path: str | os.PathLike[str], now: float) -> None:
-        """Start recording.
-
-        Raises:
-            LinkOpenError: the file cannot be written.
-            BusyError: a recording is in progress.
-        """
         if self.recording is not None:
             raise BusyError("this connection is already being recorded")
         self.recording = Recording(path, now)

@@ -236,10 +236,7 @@ class FrameReceiver:
         return True
 
     def arrived_at(self) -> float:
-        """Return the earliest possible receive time of the current frame.
-
-        This time is earlier than now if the frame may have waited in the socket.
-        """
+        """Return the receive time of the current frame. It is earlier than now if the frame may have waited."""
         now, oldest = self._clock(), self._loop_watch.oldest_arrival
         return now if now < oldest else oldest
 
@@ -247,7 +244,6 @@ class FrameReceiver:
         return (framer.statistics for framer in self._peers)
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Return the numbers of received frames and of missing sequence numbers of this system."""
         sources = [
             source
             for statistics in self.statistics()

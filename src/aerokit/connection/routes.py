@@ -247,7 +247,7 @@ class Routes:
             self._publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Forget an idle peer, and return it. None if no peer is idle."""
+        """Forget one peer that has neither recent heartbeats nor a vehicle object, and return it, or None."""
         live = {
             route.peer
             for (system_id, _), route in self._routes.items()

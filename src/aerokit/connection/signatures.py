@@ -136,10 +136,7 @@ class SignatureFilter:
         self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Return a hint for error texts if signatures are probably the problem. Empty if not.
-
-        With a key, the hint counts refused frames. Without a key, it says that one of ``heartbeats`` is signed.
-        """
+        """Return a hint for error texts about refused frames, or about signed heartbeats without a key. "" if none."""
         signing = self._encoder.signing
         if signing is not None:
             refused = "; ".join(f"{count}: {reason.value}" for reason, count in signing.refused.items() if count)

@@ -16,7 +16,6 @@ from aerokit.hub.senders import (
     MAX_RECENT_FRAMES,
     MIN_LOOP_FRAMES,
     REPEAT_WINDOW_S,
-    FrameRecord,
     RecentFrames,
     Sender,
     is_autopilot,
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from aerokit.hub.message_rules import TargetFields
+    from aerokit.hub.senders import FrameRecord
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.frame import Frame
 
@@ -187,7 +187,7 @@ class Router(Generic[PortT]):
         if out_of_order or ingress.echoes or is_full:
             return [self.route(ingress, frame, now, is_out_of_order=frame in out_of_order) for frame in frames]
         newer, older, plans = recent.newer, recent.older, []
-        record = FrameRecord(port_number, self._newest_port, now)
+        record = port_number, self._newest_port, now
         for frame in frames:
             body = frame.body
             plan = streams.get(body[4:9])  # system id, component id and message id
@@ -196,7 +196,7 @@ class Router(Generic[PortT]):
                 is_new = identity not in newer and identity not in older
                 # A frame is no copy of an earlier frame from the same port: their sequence numbers and checksums are
                 # equal by chance.
-                if is_new or (newer.get(identity) or older[identity]).port_number == port_number:
+                if is_new or (newer.get(identity) or older[identity])[0] == port_number:
                     newer[identity] = record
                     plan.sender.received_at = now
                     plans.append(plan)
@@ -226,7 +226,7 @@ class Router(Generic[PortT]):
         identity = source << 24 | body[3] << 16 | frame.checksum
         earlier = recent.newer.get(identity) or recent.older.get(identity)
         if earlier is None:
-            recent.newer[identity] = FrameRecord(number, self._newest_port, now)
+            recent.newer[identity] = number, self._newest_port, now
             if ingress.echoes:
                 self._record_new_frame(ingress, source)
         elif self._is_copy(earlier, number, now, is_out_of_order=is_out_of_order):
@@ -234,11 +234,12 @@ class Router(Generic[PortT]):
         elif self._is_echo(earlier, number, now):
             # Too late for a copy: the frame returns in a slow loop, or equals an earlier one by chance, like the first
             # command of a restarted program. It is forwarded until several frames prove a loop.
-            if self._record_echo(ingress, source, earlier.port_number, now):
+            first_port, newest_port, _ = earlier
+            if self._record_echo(ingress, source, first_port, now):
                 return self._loop
-            recent.newer[identity] = FrameRecord(earlier.port_number, earlier.newest_port, now)
+            recent.newer[identity] = first_port, newest_port, now
         else:
-            recent.newer[identity] = FrameRecord(number, self._newest_port, now)
+            recent.newer[identity] = number, self._newest_port, now
         if sender.port_number == number:
             sender.received_at = now
         else:
@@ -268,7 +269,6 @@ class Router(Generic[PortT]):
     # ------------------------------------------------------------------------------------ senders
 
     def _add_sender(self, source: int, ingress: Ingress[PortT], now: float) -> Sender:
-        """Create a sender, and store it if there is room."""
         sender = Sender(source, ingress.number, now)
         if len(self._senders) < MAX_ROUTES or self._make_room(now):
             self._senders[source] = sender
@@ -298,16 +298,16 @@ class Router(Generic[PortT]):
         """Return True if a frame that equals an earlier frame is a copy of it."""
         # A restarted program numbers its frames from the start again, so its first command may equal an earlier frame.
         # A frame that was received at the same port and in sequence is therefore no copy.
-        age_s = now - earlier.received_at
-        if earlier.port_number == number:
-            return is_out_of_order and age_s <= REPEAT_WINDOW_S
-        existed_then = number <= earlier.newest_port
-        return earlier.port_number in self._ingresses and existed_then and age_s <= DUPLICATE_WINDOW_S
+        first_port, newest_port, received_at = earlier
+        if first_port == number:
+            return is_out_of_order and now - received_at <= REPEAT_WINDOW_S
+        existed_then = number <= newest_port
+        return first_port in self._ingresses and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: FrameRecord, number: int, now: float) -> bool:
-        """Return True if an equal frame arrived at another port recently, while port ``number`` already existed."""
-        existed_then = number <= earlier.newest_port
-        return earlier.port_number != number and existed_then and now - earlier.received_at <= LOOP_WINDOW_S
+        """Return True if the earlier frame may have come back from the network behind port ``number``."""
+        first_port, newest_port, received_at = earlier
+        return first_port != number and number <= newest_port and now - received_at <= LOOP_WINDOW_S
 
     def _record_echo(self, ingress: Ingress[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True while a loop is proven."""

@@ -113,19 +113,14 @@ class Switch:
 
         ``data`` has the received bytes; None if they are not exactly the bytes of these frames.
         """
-        # Hot path: local variables are faster than attributes.
-        ingress, guard, peer = port.ingress, port.guard, port.peer
-        if ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
-            if guard is not None:
+        if port.ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
+            if port.guard is not None:
                 for frame in frames:
-                    guard.admits(frame, framer, peer)  # called because the guard records the ids of each peer
+                    port.guard.admits(frame, framer, port.peer)  # called because the guard records the ids of each peer
             port.counters.dropped["read_only"] += len(frames)
             return
         out_of_order = framer.late
-        must_check = port.signer is not None
-        if guard is not None and not must_check:
-            must_check = guard.has_several_peers or _HEARTBEAT_ID in map(_message_id, frames)
-        if must_check:
+        if self._must_check(port, frames):
             received_count = len(frames)
             frames, out_of_order = self._admitted(port, framer, frames)
             if port.signer is not None or len(frames) != received_count:
@@ -133,7 +128,7 @@ class Switch:
         if now - arrived_at > ORDER_MAX_AGE_S:
             frames = self._without_commands(port, frames, arrived_at)
             data = None
-        plans = self.router.route_all(ingress, frames, arrived_at, out_of_order)
+        plans = self.router.route_all(port.ingress, frames, arrived_at, out_of_order)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
@@ -143,6 +138,12 @@ class Switch:
             elif not (self._is_scheduled or port.reports_bursts):  # A reported burst is flushed when it ends.
                 self._is_scheduled = True
                 self._loop.call_soon(self.flush)
+
+    def _must_check(self, port: Port, frames: list[Frame]) -> bool:
+        if port.signer is not None:
+            return True
+        guard = port.guard
+        return guard is not None and (guard.has_several_peers or _HEARTBEAT_ID in map(_message_id, frames))
 
     def flush(self) -> None:
         self._is_scheduled = False

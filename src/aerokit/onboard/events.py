@@ -76,8 +76,6 @@ class EventSender:
 
 
 def answer_pings(host: ComponentHost) -> None:
-    """Answer PING and TIMESYNC requests."""
-
     def on_ping(ping: m.Ping, sender: ComponentIds) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # A PING with a target is an answer.
             host.send(m.Ping(ping.time_usec, ping.seq, *sender), sender)

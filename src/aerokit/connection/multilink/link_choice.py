@@ -138,7 +138,6 @@ class Candidate:
         self.is_other_hardware = is_other
 
     def count_answer(self) -> None:
-        """Count a TIMESYNC answer after a request for the hardware id."""
         if self._hardware_requests:
             self._answers_since_request += 1
 
@@ -276,7 +275,7 @@ class LinkChoice:
         return self.used in (None, candidate) or candidate.is_same_vehicle is True or not self.has_autopilot
 
     def carries_same_stream(self, candidate: Candidate, now: float) -> bool:
-        """Return True if the link carries the same frames as the link in use (for the link in use: as another link)."""
+        """Return True if the link carries the same frames as the link in use or, if it is that link, as another."""
         return now - candidate.copied_at <= SAME_STREAM_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:
