@@ -446,10 +446,10 @@ async def test_foreign_keys_do_not_block_clients(monkeypatch: pytest.MonkeyPatch
     for number in range(MAX_CLIENTS):
         link._on_datagram(f"noise-{number}", b"", b"")
     assert len(link.peers) == MAX_CLIENTS
-    assert link._add_client("ground-1") is None
+    assert link._get_or_add_client("ground-1") is None
     now += CLIENT_TIMEOUT_S + 1
     link._on_datagram("noise-7", b"", b"")
-    assert link._add_client("ground-1") is not None
+    assert link._get_or_add_client("ground-1") is not None
     assert len(link.peers) == MAX_CLIENTS
     assert "noise-7" in link.peers
 

@@ -42,8 +42,7 @@ EventT = TypeVar("EventT", bound=Event)
 
 # What a sink is called with. LAZY: sink(frame), or sink(frame, message) if another sink needs the message decoded.
 MESSAGE, FRAME, LAZY = range(3)
-# The sinks for one message are called with different arguments.
-MIXED = 3
+MIXED = 3  # The sinks for one message are called with different arguments.
 
 
 class _Entry(NamedTuple):
@@ -207,7 +206,7 @@ class Bus:
             return _DeliveryPlan(FRAME, ())
         taken = {entry.takes for entry in entries}
         if MESSAGE not in taken:
-            takes = FRAME  # LAZY sinks accept the frame alone.
+            takes = FRAME  # No sink needs the message decoded, because LAZY sinks accept the frame alone.
         elif taken == {MESSAGE}:
             takes = MESSAGE
         else:

@@ -53,7 +53,7 @@ class OtherPeer:
         self.is_refusal_reported: bool = False
 
     def add(self, frame: Frame, expected: int, sequence_matches: bool | None, clock_matches: bool | None) -> None:
-        """Record a frame, and whether its sequence number and time since boot fit the owner's frames (None: unknown).
+        """Record a frame, and whether its sequence number and time since boot fit the route's owner (None: unknown).
 
         ``expected`` is the owner's next sequence number, which changes with each frame of the owner.
         """

@@ -31,7 +31,7 @@ It is below 256 s, after which the sequence numbers of a component that sends on
 """
 
 MIN_LOOP_FRAMES = 8
-"""This many returning frames of one sender prove a loop. With two radios, a few frames may be equal by chance."""
+"""This many returning frames of one sender prove a loop. Fewer may be equal by chance, e.g. those of two radios."""
 
 MAX_RECENT_FRAMES = 1 << 15
 
@@ -83,7 +83,7 @@ class Sender:
         return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if frames of the sender arrive at port ``number``, and not only at `port_number`."""
+        """Return True if the sender's frames arrive at port ``number``, which may be `port_number` or another port."""
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:
@@ -161,8 +161,7 @@ class IdentityGuard:
         self._routes = Routes(link, self._publish)
         self._report = report
         self._heartbeat_at: dict[Peer, float] = {}  # time of the last heartbeat of each peer
-        # Time of the last event about a duplicate of each (system id, component id).
-        self._reported_at: dict[tuple[int, int], float] = {}
+        self._reported_at: dict[tuple[int, int], float] = {}  # (system id, component id) → time of the last event
         self._current_peer: Peer = None  # sender of the frame that is being checked
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:

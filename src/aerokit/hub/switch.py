@@ -37,8 +37,8 @@ _message_id = attrgetter("message_id")
 class Switch:
     """Forwards frames between ports, on one event loop.
 
-    Frames of one read burst are collected per port and written together: at the end of the burst if the link reports
-    it, otherwise in the next loop iteration.
+    The frames that a link reads at once are collected for each port and written together: at the call of
+    `BurstListener.burst_ended` if the link calls it, otherwise in the next loop iteration.
     """
 
     def __init__(self, dialect: Dialect, on_error: Callable[[Port, Exception], object]) -> None:

@@ -130,10 +130,7 @@ def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandA
             members = [member for member in get_args(hint) if member is not type(None)]
             is_optional = len(members) < len(get_args(hint))
             hint = members[0] if len(members) == 1 else None  # None is refused below.
-    members = list(hint) if isinstance(hint, type) and issubclass(hint, Enum) else []
-    is_enum_of_integers = bool(members) and all(isinstance(member.value, int) for member in members)
-    is_number = hint in (float, int, bool) or is_enum_of_integers
-    if not is_number:
+    if hint not in (float, int, bool) and not _is_enum_of_integers(hint):
         raise InvalidArgument(
             f"{function_name}(): argument {name} must be annotated with float, int, bool or an enum of integers"
         )
@@ -142,3 +139,8 @@ def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandA
             f"{function_name}(): argument {name} would be parameter {number}, but a command has seven parameters"
         )
     return CommandArgument(name, number, type=hint, is_optional=is_optional, range=allowed)
+
+
+def _is_enum_of_integers(hint: Any) -> bool:
+    members = list(hint) if isinstance(hint, type) and issubclass(hint, Enum) else []
+    return bool(members) and all(isinstance(member.value, int) for member in members)

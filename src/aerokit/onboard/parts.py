@@ -1,4 +1,4 @@
-"""Connects cameras and gimbals to the servers of a component."""
+"""Connects `CameraDriver` and `GimbalDriver` objects to the protocol servers of a component."""
 
 from __future__ import annotations
 

@@ -248,18 +248,16 @@ class BaseLink(Link):
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
-        stalled_since = self._stalled_at  # None if the link was not stalled until now
-        if is_stalled == (stalled_since is not None):
-            return
-        now = asyncio.get_running_loop().time()
-        self._stalled_at = now if is_stalled else None
-        receiver = self._receiver
-        if not isinstance(receiver, DrainListener):
-            return
-        if stalled_since is None:
-            receiver.link_stalled(self.unsent_bytes)
-        else:
-            receiver.link_drained(now - stalled_since)
+        stalled_at, now = self._stalled_at, asyncio.get_running_loop().time()
+        listener = self._receiver if isinstance(self._receiver, DrainListener) else None
+        if is_stalled and stalled_at is None:
+            self._stalled_at = now
+            if listener is not None:
+                listener.link_stalled(self.unsent_bytes)
+        elif not is_stalled and stalled_at is not None:
+            self._stalled_at = None
+            if listener is not None:
+                listener.link_drained(now - stalled_at)
 
     def _lose(self, reason: str, cause: BaseException | None = None, kind: type[LinkLost] = LinkLost) -> None:
         """Release the link and report its loss to the receiver, once."""

@@ -115,7 +115,7 @@ class TcpConnect(_TcpLink):
     async def _connect(self) -> None:
         with anyio.move_on_after(self._connect_timeout_s):
             return await self._connect_to_any(await resolve(self._host, self._port, socket.SOCK_STREAM))
-        # The block above returns after a success, so this line is reached only after the time-out.
+        # Only a time-out leads here, because the `with` block returns after a success.
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:

@@ -114,7 +114,7 @@ class ZenohConnect(NetworkLink):
             await self._first_beacon.wait()
             self._schedule_poll()
             return
-        # The block above returns after a success, so these lines are reached only after the time-out.
+        # Only a time-out leads here, because the `with` block returns after a success.
         if self._session is None:
             reason = f"the zenoh network was not reached within {self._open_timeout_s:g} s"
             raise LinkOpenError(f"cannot open {self.address}: {reason}")

@@ -121,7 +121,7 @@ class ZenohListen(NetworkLink):
         if self._may_have_conflict:
             with anyio.move_on_after(_BEACON_TIMEOUT_S):
                 await self._name_conflict.wait()
-                # After a time-out, the block ends in the line above. This line is reached only if a beacon arrived.
+                # Only a beacon leads here, because a time-out cancels wait() and ends the `with` block.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         with zenoh_errors(self.address, self._zenoh):
             await open_in_thread(partial(self._serve, queue, session))
@@ -185,7 +185,7 @@ class ZenohListen(NetworkLink):
 
     def _on_datagram(self, name: str, data: bytes, attachment: bytes) -> None:
         now = self._now()
-        client = self._add_client(name)
+        client = self._get_or_add_client(name)
         if client is None:
             return
         client.received_at = now
@@ -203,13 +203,13 @@ class ZenohListen(NetworkLink):
         if accepted:
             self._deliver(accepted, name)
 
-    def _add_client(self, name: str) -> ClientFilter | None:
-        """Return the client with this name, new or known. None if it cannot be added."""
+    def _get_or_add_client(self, name: str) -> ClientFilter | None:
+        """Return the client with this name, which is created if needed; None if there is no room for it."""
         client = self._clients.get(name)
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
         if client is None and len(self._clients) < MAX_CLIENTS:
-            with contextlib.suppress(InvalidArgument):  # A program other than aerokit may use a wrong name.
+            with contextlib.suppress(InvalidArgument):  # A program other than aerokit may use an invalid name.
                 client = self._clients[name] = ClientFilter(check_name("client", name), self._lease)
                 client.received_at = self._now()
         return client
@@ -222,7 +222,7 @@ class ZenohListen(NetworkLink):
 
     def _on_client_joined(self, name: str) -> None:
         # The next beacon is sent earlier, so that the client need not wait.
-        if self._add_client(name) is not None and self._timer is not None:
+        if self._get_or_add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
             self._timer = asyncio.get_running_loop().call_later(delay_s, self._send_beacon)
