@@ -119,10 +119,9 @@ class Connection:
         self._signatures = SignatureFilter(self._encoder, self.unix_time, self.bus.publish)
         self.signing = signing
         make_routes = partial(Routes, link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
-        # None with a single link; otherwise the same object as `_routes`.
-        self._multilink = self._make_multilink(make_routes) if link.is_multilink else None
+        self._multilink = self._make_multilink(make_routes) if link.is_multilink else None  # None with a single link
         self._routes: Routes | MultiLinkRoutes = self._multilink or make_routes()
-        self._receiver = FrameReceiver(link, self.bus, self._routes, self._multilink, self._signatures, self._clock)
+        self._receiver = FrameReceiver(link, self.bus, self._routes, self._signatures, self._clock)
         self._observers = self._receiver.observers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = self._receiver.heartbeats
         """Last HEARTBEAT of every (system id, component id) on the link."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.connection.frame_observers import FrameObservers
 from aerokit.connection.heartbeats import discovery_event
 from aerokit.connection.loop_watch import IPYTHON_HINT, LoopWatch, is_unintegrated_ipython
-from aerokit.connection.routes import MAX_ROUTES
+from aerokit.connection.routes import MAX_ROUTES, Routes
 from aerokit.events import ComputerSlept, LoopBlocked
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Heartbeat
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from aerokit.connection.bus import Bus
     from aerokit.connection.multilink.routes import MultiLinkRoutes
-    from aerokit.connection.routes import Routes
     from aerokit.connection.signatures import SignatureFilter
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
@@ -129,8 +128,7 @@ BLOCKING_CODE_HINT = (
 class FrameReceiver:
     """Checks the framing, signature and route of received frames, with one framer for each peer.
 
-    Accepted frames go to ``bus``, then to the observers. With several links, the same object is passed as ``routes``
-    and as ``multilink``; with one link, ``multilink`` is None. ``clock`` is the clock of the event loop.
+    Accepted frames go to ``bus``, then to the observers. ``clock`` is the clock of the event loop.
     """
 
     def __init__(
@@ -138,12 +136,12 @@ class FrameReceiver:
         link: Link,
         bus: Bus,
         routes: Routes | MultiLinkRoutes,
-        multilink: MultiLinkRoutes | None,
         signatures: SignatureFilter,
         clock: Callable[[], float],
     ) -> None:
         self._bus, self._signatures, self._clock = bus, signatures, clock
-        self._routes, self._multilink = routes, multilink
+        self._routes = routes
+        self._multilink = None if isinstance(routes, Routes) else routes  # None with a single link
         self._peers = PeerTable(link, bus.dialect, routes.evict_idle_peer, self._update_framer)
         self.framers: dict[Peer, Framer] = self._peers.framers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = {}
@@ -151,7 +149,7 @@ class FrameReceiver:
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
         self._is_closed = False  # True once the connection has ended; frames are then dropped
-        bus.must_check_frames = multilink is not None
+        bus.must_check_frames = self._multilink is not None
         signatures.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
 
