@@ -276,10 +276,11 @@ class Hub:
             except Exception:
                 logger.exception("listener %r raised an exception; the others are still called", listener)
 
-    def _on_change(self, kind: HubEventKind, source: int, port: Port, other_port: Port | None) -> None:
+    def _on_change(self, kind: HubEventKind, sender: tuple[int, int], port: Port, other_port: Port | None) -> None:
         if other_port is not None and other_port.endpoint == port.endpoint and kind == "route_changed":
             return  # The endpoint's IdentityGuard reports a change between two peers of the same endpoint.
-        ids = f"{source & 0xFF}/{source >> 8}"
+        system_id, component_id = sender
+        ids = f"{system_id}/{component_id}"
         other = "a removed endpoint" if other_port is None else other_port.endpoint
         text = {
             "duplicate_sender": f"{ids} is received here and at {other}; messages for it go to {other}: two links to"

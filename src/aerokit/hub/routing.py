@@ -138,11 +138,9 @@ class Router(Generic[PortT]):
         self._unknown: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="unknown")
         self.on_autopilot: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
-        self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
-        """Called with the kind of event, the sender, the port of the frame, and another port that received the sender.
-
-        The other port is None if it was removed since.
-        """
+        self.on_change: Callable[[HubEventKind, tuple[int, int], PortT, PortT | None], object] | None = None
+        """Called with the kind of event, the system id and component id of the sender, the port of the frame, and
+        another port at which the sender was received; None if this port was removed since."""
 
     def add(self, port: PortT) -> Ingress[PortT]:
         self._newest_port += 1
@@ -329,7 +327,8 @@ class Router(Generic[PortT]):
     def _report(self, kind: HubEventKind, source: int, ingress: Ingress[PortT], other_number: int) -> None:
         if self.on_change is not None:
             other = self._ingresses.get(other_number)
-            self.on_change(kind, source, ingress.port, None if other is None else other.port)
+            ids = source & 0xFF, source >> 8
+            self.on_change(kind, ids, ingress.port, None if other is None else other.port)
 
     def _record_heartbeat(self, sender: Sender, ingress: Ingress[PortT], body: bytes) -> None:
         is_first = sender.source in self._without_heartbeat
