@@ -54,8 +54,8 @@ class Recording:
         self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
         self._writer: TlogWriter | None = None  # None while frames wait (see `_waiting`) and after the end
         self._file: BinaryIO | None = None  # the file of the writer
-        # Sent frames that wait until a frame is received, because the existing file is renamed only then. None if
-        # frames need not wait.
+        # Sent frames that wait for the first received frame, at which an existing file is renamed. None if they need
+        # not wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.
@@ -95,7 +95,7 @@ class Recording:
     def _open_new(self) -> None:
         while True:
             try:
-                # Another program may have created the file a moment ago. Mode "x" then fails.
+                # Mode "x" fails if another program has just created the file.
                 self._file = open(self._path, "xb")  # noqa: SIM115 - closed by close()
             except FileExistsError:
                 if (kept := keep_existing(self._path)) is not None:

@@ -55,7 +55,7 @@ NON_AUTOPILOT_TYPES = frozenset(
 
 
 def is_autopilot(heartbeat: Heartbeat) -> bool:
-    # Some components set autopilot GENERIC instead of INVALID, so their type counts, too.
+    # Some components set autopilot GENERIC instead of INVALID, so the type is checked as well.
     return heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type not in NON_AUTOPILOT_TYPES
 
 

@@ -45,7 +45,7 @@ def suspended_s() -> float:
 
 def loop_clock() -> Callable[[], float]:
     loop = asyncio.get_running_loop()
-    # asyncio's own loops use this clock, too. Reading it directly is faster.
+    # asyncio's own loops use time.monotonic(). Calling it directly is faster.
     return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time
 
 

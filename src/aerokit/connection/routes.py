@@ -235,7 +235,7 @@ class Routes:
 
     def exclude_pause(self, now: float, paused_s: float) -> None:
         """Do not count the last ``paused_s`` seconds as silence, because the event loop read nothing."""
-        # Otherwise a vehicle with the same ids could take over a route before the owner's next heartbeat.
+        # If a pause counted as silence, another vehicle with the same ids could take over a route.
         for route in self._routes.values():
             route.silent_since = min(now, route.silent_since + paused_s)
 

@@ -59,7 +59,7 @@ class BackgroundTasks:
 
         None of these tasks may call it, because the task would wait for its own end.
         """
-        self.cancel()  # `start` then starts no further tasks.
+        self.cancel()  # Afterwards, `start` starts no tasks.
         cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
         with anyio.CancelScope(shield=True):
             while self._tasks:

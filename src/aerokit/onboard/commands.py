@@ -239,7 +239,7 @@ class ComponentCommands:
     ) -> None:
         execution = _Execution(self, function)
         running = self._running.start(command, execution.cancel, is_stop=is_stop)
-        if running is not None:  # Otherwise start() has answered: it is a repetition, or another command is running.
+        if running is not None:  # None if start() has answered a repetition, or rejected the command.
             execution.begin(running, arguments)
 
 

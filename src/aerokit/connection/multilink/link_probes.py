@@ -109,7 +109,7 @@ class LinkProbes:
         if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:
             return False
         if frame.component_id != _AUTOPILOT:
-            return True  # A companion computer may answer, too; its clock is not the vehicle's.
+            return True  # A companion computer has answered, whose clock is not the vehicle's.
         now = frame.received_at
         round_trip_s = self._round_trip_of(message, frame.system_id, link, now)
         choice = self._choices.get(frame.system_id)

@@ -345,8 +345,7 @@ class MultiLinkRoutes:
         link, previous_link = self._link.names[used.link], None
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
-            # The link cannot tell for which system the data is, so data for other systems is discarded, too. Commands
-            # and transfers send it again.
+            # This includes data for other systems. Commands and transfers send it again.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             previous_link = self._link.names[before.link]

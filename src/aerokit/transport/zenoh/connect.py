@@ -153,7 +153,7 @@ class ZenohConnect(NetworkLink):
             liveliness.declare_token(keys.client_token(client)),
         ]
         publisher = session.declare_publisher(keys.to_server(client), congestion_control=zenoh.CongestionControl.DROP)
-        if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
+        if queue is self._queue:  # False if this opening was cancelled while the thread was working.
             self._declared, self._publisher = declared, publisher
 
     def _on_release(self, session: Any) -> None:

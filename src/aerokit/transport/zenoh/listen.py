@@ -142,7 +142,7 @@ class ZenohListen(NetworkLink):
         # while. A beacon proves it.
         tokens = session.liveliness().get(self._keys.server_token(), timeout=_TOKEN_QUERY_TIMEOUT_S)
         may_have_conflict = bool(list(tokens))
-        if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
+        if queue is self._queue:  # False if this opening was cancelled while the thread was working.
             self._declared, self._may_have_conflict = declared, may_have_conflict
 
     def _serve(self, queue: LoopQueue, session: Any) -> None:
