@@ -131,7 +131,7 @@ class Router(Generic[PortT]):
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
         self._newest_port = 0  # number of the last created port
-        self._without_heartbeat: dict[int, None] = {}  # These senders may be noise.
+        self._without_heartbeat: dict[int, None] = {}  # senders that may be noise, as keys in order
         self._swept_at = -math.inf  # time of the last removal of silent senders
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")

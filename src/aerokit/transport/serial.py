@@ -127,7 +127,7 @@ class SerialLink(BaseLink):
                 port.close()
                 raise
         except _TermiosError as error:
-            # This error occurs if the device vanishes while it is being opened. pyserial does not convert it.
+            # pyserial does not convert a termios.error, which occurs if the device vanishes while it is being opened.
             raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:

@@ -345,7 +345,7 @@ class MultiLinkRoutes:
         link, previous_link = self._link.names[used.link], None
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
-            # This includes data for other systems. Commands and transfers send it again.
+            # Data for other systems is discarded with it. Commands and transfers repeat what was discarded.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             previous_link = self._link.names[before.link]
