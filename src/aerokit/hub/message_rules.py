@@ -58,9 +58,8 @@ class Filters:
         self._only = tuple(only)
         self._block = tuple(block)
         self._rates = dict(rates or {})
-        self._min_intervals: dict[
-            int, float | None
-        ] = {}  # results of `min_interval`, which are computed at the first call
+        # Results of `min_interval`, which are computed at the first call.
+        self._min_intervals: dict[int, float | None] = {}
         for field, patterns in (("only", self._only), ("block", self._block), ("rates", self._rates)):
             for pattern in patterns:
                 self._check(field, pattern)
