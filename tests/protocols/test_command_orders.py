@@ -32,6 +32,8 @@ ACCEPTED, DENIED, IN_PROGRESS = 0, 2, 5
 class Status:
     """An order's status, set by the test."""
 
+    heartbeat_name = "HEARTBEAT"
+
     def __init__(self, end: str = "", heartbeat_at: float = -1.0) -> None:
         self.end, self.heartbeat_at = end, heartbeat_at
 

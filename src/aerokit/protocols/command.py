@@ -118,6 +118,11 @@ class OrderStatus(Protocol):
         """Time of the last HEARTBEAT, on the clock of the exchange."""
         ...
 
+    @property
+    def heartbeat_name(self) -> str:
+        """Name of this HEARTBEAT in error texts, e.g. ``"HEARTBEAT of component 100"``."""
+        ...
+
 
 def command_long(
     target_system: int, target_component: int, command: int, params: tuple[float, ...] = ()
@@ -306,7 +311,7 @@ class CommandExchange(Exchange[CommandAck]):
         # The time is checked first: if the event loop was blocked, a recent HEARTBEAT must not cause a late repetition.
         give_up_at = self._started_at + self._attempts * self._attempt_timeout
         if now >= give_up_at:
-            self._time_out(now, self._why_not_repeated())
+            self._time_out(now, self._why_not_repeated(order_status))
             return
         # A HEARTBEAT after this time shows that the link to the vehicle works.
         min_heartbeat_at = max(self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout, now - MAX_HEARTBEAT_AGE_S)
@@ -315,9 +320,9 @@ class CommandExchange(Exchange[CommandAck]):
         else:
             self.deadline = min(now + POLL_INTERVAL_S, give_up_at)
 
-    def _why_not_repeated(self) -> str:
+    def _why_not_repeated(self, order_status: OrderStatus) -> str:
         if self._sent_count < self._attempts:
-            return "; not sent again: no HEARTBEAT received since then"
+            return f"; not sent again: no {order_status.heartbeat_name} received since then"
         if self._attempts == 1 and allowed_attempts(self._message.command, _params_of(self._message)) == 1:
             repetition = UNREPEATABLE_COMMANDS[self._message.command]
             return f"; not sent again, because a repetition {repetition.effect}"

@@ -457,3 +457,45 @@ async def test_order_is_not_resent_to_silent_camera() -> None:
         await anyio.sleep(3)
         await flight.vehicle.camera.zoom_to(60)
         assert sent() == 3
+
+
+# ------------------------------------------------------------------------------ a camera that is found late
+
+
+async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
+    camera = SimulatedCamera()
+    camera.faults.heartbeats_stopped = True
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+        first = flight.vehicle.camera
+        with pytest.raises(OperationTimeout, match="did not identify itself"):
+            await first.wait_found()
+        with pytest.raises(CommandRejected):  # The autopilot has no camera.
+            await first.zoom_to(50)
+        assert first.number == 1
+        camera.faults.heartbeats_stopped = False
+        await anyio.sleep(2.0)
+        assert (flight.vehicle.camera, first.number) == (first, 100)
+        assert (await first.take_photo()).camera == 100
+        await first.zoom_to(50)
+        orders = [message for message in flight.wire.commands(ZOOM) if isinstance(message, m.CommandLong)]
+        assert [order.target_component for order in orders] == [1, 100]
+
+
+@pytest.mark.parametrize("sign", ["report", "order", "number"])
+async def test_late_camera_does_not_replace_known_autopilot_camera(sign: str) -> None:
+    camera = SimulatedCamera()
+    camera.faults.heartbeats_stopped = True
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+        first = flight.vehicle.camera
+        with pytest.raises(OperationTimeout, match="did not identify itself"):
+            await first.wait_found()
+        if sign == "report":
+            flight.copter.send(m.CameraFeedback(0, 1, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0))
+        elif sign == "order":
+            flight.copter.faults.refuse(ZOOM, MavResult.ACCEPTED)
+            await first.zoom_to(50)
+        else:
+            assert flight.vehicle.camera_at(1) is first
+        camera.faults.heartbeats_stopped = False
+        await anyio.sleep(2.0)
+        assert (first.number, flight.vehicle.cameras.value) == (1, (100, 1) if sign == "report" else (100,))

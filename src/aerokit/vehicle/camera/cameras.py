@@ -235,6 +235,7 @@ class Cameras:
             )
         if number not in self._cameras:
             if number == self._first_link.number:  # `first` already stands for this camera.
+                self._first_link.bind(number)  # If the number was a guess, the program has now confirmed it.
                 return self.first
             link = CameraLink(self._context, self._components.component, number)
             link.start_polling()
@@ -294,8 +295,9 @@ class Cameras:
         if number not in numbers:
             source = Source(self._session.system_id, frame.component_id, message.NAME)
             self.cell.set(tuple(sorted((*numbers, number), key=_sort_key)), source)
-        # The first camera with its own component id becomes `first`.
-        if not has_autopilot_number and self._first_link.number is None:
+        # The first camera with its own component id becomes `first`, unless the autopilot's camera has done so. That
+        # camera may have been a guess, which its own message confirms.
+        if not has_autopilot_number or number == self._first_link.number:
             self._first_link.bind(number)
         return int(number)
 

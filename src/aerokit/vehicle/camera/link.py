@@ -63,7 +63,9 @@ class CameraLink(CameraOrders):
         # The component and the number of the camera are None until a camera is found.
         self._component: Component | None = None
         self.number = None
+        self._ordered_topics = set()
         self._listeners: list[tuple[type[Message], Callable[[Any], object]]] = []
+        self._detach_listeners: list[Detach] = []
         self.requests: MessageRequests = MessageRequests(self)
         self._is_polling = False
         # Messages that the camera refused to send.
@@ -71,7 +73,8 @@ class CameraLink(CameraOrders):
         # Called when the camera's log of captures was cleared.
         self.on_cleared: list[Callable[[], None]] = []
         self._identify_lock = anyio.Lock()
-        self._is_bound = anyio.Event()
+        # Set once `number` is known to be right. Before that, `number` is None, or a guess.
+        self._is_found = anyio.Event()
         # Time of the camera's last HEARTBEAT.
         self._heartbeat_at = -math.inf
         # True if an identified camera was silent and must identify itself again: another camera may now use its id.
@@ -125,15 +128,23 @@ class CameraLink(CameraOrders):
         model = "".join(character for character in model if character.isprintable())
         return f"camera {self.number}{f' ({model})' if model else ''}"
 
-    def bind(self, number: int) -> None:
-        if self.number is not None:
+    def bind(self, number: int, *, is_guess: bool = False) -> None:
+        """Address this camera from now on. A later call can only replace a guess to which no order was given."""
+        has_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
+        if self._is_found.is_set() or has_orders:
+            return
+        if not is_guess:
+            self._is_found.set()
+        if number == self.number:
             return
         self.number = number
         self._on_bound(number)
         component_id = self._session.component_id if number in AUTOPILOT_CAMERA_IDS else number
         self._component = self._component_of(component_id)
         self._heartbeat_at = self._session.connection.last_heartbeat_at(self._session.system_id, component_id)
-        self._is_bound.set()
+        self._forget_refusals()
+        for detach in self._detach_listeners:
+            detach()
         for message_type, callback in self._listeners:
             self._attach(message_type, callback)
 
@@ -165,9 +176,9 @@ class CameraLink(CameraOrders):
         # wait for the heartbeat of such a camera.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
-            await self._is_bound.wait()
-        if self.number is None:  # The only other possibility is a camera that is attached to the autopilot.
-            self.bind(AUTOPILOT_CAMERA_IDS[0])
+            await self._is_found.wait()
+        if self.number is None:  # Until a camera sends a message, assume that one is attached to the autopilot.
+            self.bind(AUTOPILOT_CAMERA_IDS[0], is_guess=True)
 
     async def _request_information(self) -> None:
         # An autopilot may have no information about a camera that is attached to it.
@@ -250,7 +261,9 @@ class CameraLink(CameraOrders):
                 callback(message)
 
         if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
-            self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
+            detach = bus.attach(message_type, on_message, system_id=self._session.system_id)
+            self._detach_listeners.append(detach)
+            self._session.at_close(detach)
 
     def _is_from_this_camera(self, message: Any) -> bool:
         if not self.is_autopilot_attached:

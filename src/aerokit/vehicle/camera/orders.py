@@ -55,6 +55,11 @@ class _ResendGuard:
     def heartbeat_at(self) -> float:
         return self._sent.heartbeat_at if self._link.is_autopilot_attached else self._link.heartbeat_at()
 
+    @property
+    def heartbeat_name(self) -> str:
+        has_own_heartbeat = not self._link.is_autopilot_attached and self._link.is_autopilot_present
+        return f"HEARTBEAT of component {self._link.component.component_id}" if has_own_heartbeat else "HEARTBEAT"
+
 
 class CameraOrders:
     """Base class of `CameraLink`: sends commands to one camera. A newer order ends the retries of an earlier one."""
@@ -64,6 +69,9 @@ class CameraOrders:
     _component: Component | None
     # Number of the camera: 1 to 6 if attached to the autopilot, otherwise its component id; None until bound.
     number: int | None
+
+    # Topics of the orders given by this object.
+    _ordered_topics: set[Topic]
 
     @property
     def is_autopilot_attached(self) -> bool:
@@ -85,7 +93,11 @@ class CameraOrders:
     def heartbeat_at(self) -> float:
         """Loop time of the camera's last HEARTBEAT; -inf while the autopilot is silent."""
         received_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
-        return received_at if self._context.arbiter.is_state_recent else -math.inf
+        return received_at if self.is_autopilot_present else -math.inf
+
+    @property
+    def is_autopilot_present(self) -> bool:
+        return self._context.arbiter.is_state_recent
 
     @property
     def on_finish(self) -> Callable[[Callable[[], None]], Detach]:
@@ -96,7 +108,9 @@ class CameraOrders:
         return ("camera", self.component.component_id, self.device_id, subject)
 
     def begin_order(self, subject: str) -> Order:
-        return self._context.arbiter.device_order(self.topic(subject), may_be_withdrawn=True)
+        topic = self.topic(subject)
+        self._ordered_topics.add(topic)
+        return self._context.arbiter.device_order(topic, may_be_withdrawn=True)
 
     def latest_order(self, subject: str) -> Order | None:
         return self._context.arbiter.latest(self.topic(subject))
@@ -153,12 +167,6 @@ class CameraOrders:
                 # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
                 raise session.with_reasons(error, started_at) from None
-            except CommandTimeout as error:
-                if not self.is_autopilot_attached and arbiter.is_state_recent:
-                    # The rest of the text has the age of the autopilot's HEARTBEAT.
-                    source = f"no HEARTBEAT of component {self.component.component_id} "
-                    error.args = (str(error).replace("no HEARTBEAT ", source),)
-                raise
 
     async def order_once(
         self,

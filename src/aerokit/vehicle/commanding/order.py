@@ -319,6 +319,8 @@ class SentCommand:
     returns how many seconds the computer has slept since the first transmission.
     """
 
+    heartbeat_name: str = "HEARTBEAT"
+
     def __init__(
         self,
         order: Order,
