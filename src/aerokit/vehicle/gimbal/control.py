@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["GimbalControl"]
 
 RELEASE_ATTEMPTS, ATTEMPT_TIMEOUT_S = 10, 0.5
+# A message has no acknowledgement, so it is repeated.
+FINAL_MESSAGE_COUNT, FINAL_MESSAGE_INTERVAL_S = 5, 0.1
 
 
 class ReleaseCommand:
@@ -41,8 +43,8 @@ class ReleaseCommand:
 
     If the vehicle is silent, the command is sent at the next HEARTBEAT. ``is_still_due`` is checked before each
     attempt, so that the command does not undo a newer order or the control of another station. If the gimbal manager
-    has fallen silent, the command is sent once more at its next HEARTBEAT. ``final_message`` is sent after the
-    acknowledgement.
+    has fallen silent, the command is sent once more at its next HEARTBEAT. ``final_message`` is sent several times
+    after the acknowledgement.
     """
 
     def __init__(
@@ -131,8 +133,12 @@ class ReleaseCommand:
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
                 was_just_sent=True,
             )
-        if self._final_message is not None and self._session.is_open and self._is_still_due():
-            self._session.connection.send(self._final_message)
+        if self._final_message is not None:
+            for _ in range(FINAL_MESSAGE_COUNT):
+                if not self._session.is_open or not self._is_still_due():
+                    break
+                self._session.connection.send(self._final_message)
+                await asyncio.sleep(FINAL_MESSAGE_INTERVAL_S)
 
     def _is_target_silent(self) -> bool:
         is_autopilot = self._target == self._session.component_id
