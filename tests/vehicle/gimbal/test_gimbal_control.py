@@ -213,6 +213,19 @@ async def test_out_of_order_status_does_not_lose_control() -> None:
         assert control.is_held
 
 
+@pytest.mark.parametrize("sequence", [7, 255])
+async def test_out_of_order_status_of_same_millisecond_does_not_lose_control(sequence: int) -> None:
+    gimbal = SimulatedGimbal()
+    async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control() as control:
+        encoder, now_ms = FrameEncoder(1, 154), gimbal.time_boot_ms
+        encoder.sequence = sequence
+        before, after = (m.GimbalManagerStatus(now_ms, 0, 154, *ids, 0, 0) for ids in (OTHER, own_ids(flight)))
+        first, second = encoder.encode(before), encoder.encode(after)
+        flight.wire.deliver(second)
+        flight.wire.deliver(first)
+        assert control.is_held
+
+
 async def test_second_control_block_is_busy() -> None:
     async with with_gimbals(SimulatedGimbal()) as flight:
         gimbal = flight.vehicle.gimbal

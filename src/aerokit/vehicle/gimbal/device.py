@@ -189,9 +189,9 @@ class GimbalDevice:
         # True once a message from this gimbal was received. The program may name it earlier.
         self.is_discovered = False
         self.pending_orders: int = 0  # number of calls that are waiting for the end of an order to this gimbal
-        # Rank of the known manager, and time stamp of its newest status; see `update_manager` and `update_status`.
+        # Rank of the known manager, and its newest status; see `update_manager` and `update_status`.
         self._manager_rank = 0
-        self._status_ms = 0
+        self._newest_status: GimbalManagerStatus | None = None
         self._system_id = context.session.system_id
         context.session.register_cell(self.attitude)
         context.session.register_cell(self.controllers)
@@ -232,10 +232,9 @@ class GimbalDevice:
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
         """Record the controllers of the gimbal. Return False if the message arrived late."""
-        older_by_ms = self._status_ms - message.time_boot_ms
-        if 0 < older_by_ms < REORDER_WINDOW_MS:
+        if self._newest_status is not None and _is_older(message, self._newest_status):
             return False
-        self._status_ms = message.time_boot_ms
+        self._newest_status = message
         self.set_controllers(message)
         return True
 
@@ -250,11 +249,11 @@ class GimbalDevice:
         elif self.manager_id is None or rank > self._manager_rank or is_old_gone:
             self.manager_id = component_id
             self._manager_rank = rank
-            self._status_ms = 0  # The time stamps of the new manager are from another clock.
+            self._newest_status = None  # The time stamps of the new manager are from another clock.
 
     def reset(self) -> None:
         self.reboots += 1
-        self._status_ms = 0
+        self._newest_status = None
         self._manager_rank = 0
         self.manager_id = self.component_id if self.number else None  # as for a new gimbal
         self.flags = 0
@@ -268,6 +267,15 @@ class GimbalDevice:
     def _source(self, message: Message) -> Source:
         frame = message.received_frame
         return Source(self._system_id, self.component_id if frame is None else frame.component_id, message.NAME)
+
+
+def _is_older(message: GimbalManagerStatus, newest: GimbalManagerStatus) -> bool:
+    older_by_ms = newest.time_boot_ms - message.time_boot_ms
+    frame, newest_frame = message.received_frame, newest.received_frame
+    if older_by_ms == 0 and message.time_boot_ms and frame is not None and newest_frame is not None:
+        # The manager sent both in the same millisecond. The sequence number of MAVLink frames returns to 0 after 255.
+        return 0 < (newest_frame.sequence - frame.sequence) % 256 < 128
+    return 0 < older_by_ms < REORDER_WINDOW_MS
 
 
 class ControlRequest:
