@@ -14,6 +14,7 @@ from aerokit import Position
 from aerokit import messages as m
 from aerokit.connection.cells import Source
 from aerokit.errors import (
+    AerokitError,
     BusyError,
     CommandRejected,
     CommandTimeout,
@@ -29,6 +30,7 @@ from aerokit.mavlink.enums import MavCmd, MavMountMode, MavResult
 from aerokit.sim import SimulatedCopter, SimulatedGimbal
 from aerokit.sim.faults import CommandFault
 from aerokit.vehicle.gimbal.discovery import MAX_GIMBALS
+from aerokit.vehicle.gimbal.gimbal import Gimbal
 
 pytestmark = pytest.mark.anyio
 
@@ -163,6 +165,27 @@ async def test_denial_after_stale_acceptance_ends_wait() -> None:
         with pytest.raises(CommandRejected, match=r"accepted the command and then refused it.*DENIED"):
             await flight.vehicle.gimbal.point(-30.0, 0.0)
         assert now() - began < 2.0
+
+
+async def test_late_denial_ends_only_the_newest_wait_of_a_manager() -> None:
+    async with mounted() as flight:
+        flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
+        first, second = flight.vehicle.gimbals[1], flight.vehicle.gimbals[2]
+        ends: dict[int, type[Exception]] = {}
+
+        async def point(gimbal: Gimbal) -> None:
+            try:
+                await gimbal.point(-30.0, 0.0, timeout=6.0)
+            except AerokitError as error:
+                ends[gimbal.device_id] = type(error)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(point, first)
+            await anyio.sleep(1.0)
+            tasks.start_soon(point, second)
+            await anyio.sleep(3.0)
+            flight.copter.send(m.CommandAck(PITCHYAW, MavResult.DENIED, 0, 0, *own_ids(flight)))
+        assert ends == {2: CommandRejected, 1: OperationTimeout}
 
 
 async def test_second_copy_of_denial_does_not_end_wait() -> None:

@@ -201,9 +201,13 @@ class CommandSender:
     def late_refusal(self, command: int, component_id: int, since: float) -> int | None:
         """Return the MAV_RESULT of a refusal after ``since`` for which no call waited; None if there was none.
 
-        The ack that a call took for its own was then the late or repeated ack of an earlier command.
+        The ack that a call took for its own was then the late or repeated ack of an earlier command. After several
+        calls, the refusal belongs to the newest one, so it is None for the others.
         """
-        received_at, result = self._late_refusals.get((component_id, command), (-math.inf, None))
+        key = (component_id, command)
+        if self._accepted_at.get(key, -math.inf) > since:
+            return None
+        received_at, result = self._late_refusals.get(key, (-math.inf, None))
         return result if received_at >= since else None
 
     def forget_result(self, command: int, component_id: int | None = None) -> None:
