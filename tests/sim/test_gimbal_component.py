@@ -144,6 +144,12 @@ def test_messages_control_the_gimbal() -> None:
     client.send(m.GimbalManagerSetManualControl(1, GIMBAL, 0, 0, NAN, NAN, -0.5, 0.0))
     client.run(1.0)
     assert degrees(gimbal)[1] == pytest.approx(-40.0, abs=1.0)
+    client.send(m.GimbalManagerSetManualControl(1, GIMBAL, 0, 0, -0.5, 0.25, NAN, NAN))
+    client.run(3.0)
+    assert degrees(gimbal) == pytest.approx([0.0, -45.0, 45.0])  # The limits are -90 to 25 and -180 to 180.
+    client.send(m.GimbalManagerSetManualControl(1, GIMBAL, 0, 0, 1.0, 0.0, NAN, NAN))
+    client.run(3.0)
+    assert degrees(gimbal) == pytest.approx([0.0, 25.0, 0.0])
     client.send(m.GimbalManagerSetPitchyaw(1, GIMBAL, Flags.NEUTRAL, 0, NAN, NAN, NAN, NAN))
     client.run(3.0)
     assert degrees(gimbal) == pytest.approx([0.0, 0.0, 0.0])

@@ -293,10 +293,18 @@ class GimbalRequests:
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
         if self._may_control(sender_of(message), message.gimbal_device_id):
-            # The angles are taken as radians. The rates are fractions of the slew rate, from -1 to 1.
+            # All values are from -1 to 1: fractions of the limits and of the slew rate. PX4 takes such angles as radians
+            # (input_mavlink.cpp, _process_set_manual_control), against the specification.
+            _, pitch_limits, yaw_limits = self._gimbal.limits
+            angles = (0.0, _scaled(message.pitch, pitch_limits), _scaled(message.yaw, yaw_limits))
             slew_rad_s = self._gimbal.slew_rad_s
             rates = (0.0, message.pitch_rate * slew_rad_s, message.yaw_rate * slew_rad_s)
-            self.apply(message.flags, (0.0, message.pitch, message.yaw), rates)
+            self.apply(message.flags, angles, rates)
+
+
+def _scaled(deflection: float, limits: tuple[float, float]) -> float:
+    minimum, maximum = limits
+    return deflection * (maximum if deflection > 0 else -minimum)
 
 
 def _owner(current: ComponentIds, requested: ComponentIds, sender: ComponentIds) -> ComponentIds:
