@@ -203,7 +203,7 @@ class ArduPilot(Autopilot):
     )
     highres_imu_field_ut: float = 1e-4
     reports_gripper_by_text = True
-    winch_actions: frozenset[int] = frozenset((0, 1, 2))
+    winch_actions: frozenset[int] = frozenset()
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
         return (
@@ -231,6 +231,7 @@ class ArduCopter(ArduPilot):
 
     firmware = "ArduCopter"
     has_vtols = False
+    winch_actions: frozenset[int] = frozenset((0, 1, 2))
     mission_needs_take_off = True  # ModeAuto::init refuses the mission with "Auto: Missing Takeoff Cmd".
     modes: ModeTable = COPTER
     purposes: ClassVar[Mapping[str, str]] = {

@@ -490,5 +490,5 @@ class Autopilot:
     has_shell: bool = False
     """True if SERIAL_CONTROL reaches a system shell."""
     winch_actions: frozenset[int] = frozenset(range(10))
-    """WINCH_ACTIONS that MAV_CMD_DO_WINCH (42600) supports."""
+    """WINCH_ACTIONS that the autopilot itself executes (MAV_CMD_DO_WINCH)."""
     unsupported_messages: frozenset[str] = frozenset()

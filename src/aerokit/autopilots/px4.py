@@ -167,6 +167,7 @@ class Px4(Autopilot):
     )
 
     has_shell = True
+    winch_actions: frozenset[int] = frozenset()  # PX4 passes DO_WINCH on to other components, and ignores it itself.
 
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)

@@ -46,8 +46,8 @@ class GimbalDriver:
         roll_deg: minimum and maximum roll angle.
         pitch_deg: minimum and maximum pitch angle.
         yaw_deg: minimum and maximum yaw angle.
-        max_rate_deg_s: maximum rate. Manual control with full deflection (GIMBAL_MANAGER_SET_MANUAL_CONTROL) commands this
-            rate, or the minimum or maximum angle.
+        max_rate_deg_s: maximum rate. Full deflection in GIMBAL_MANAGER_SET_MANUAL_CONTROL commands this rate, or the
+            minimum or maximum angle.
         attitude_hz: rate of GIMBAL_DEVICE_ATTITUDE_STATUS, 0 to 100.
     """
 

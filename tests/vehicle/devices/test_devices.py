@@ -168,8 +168,9 @@ async def test_winch_order_that_firmware_lacks_is_sent_to_component_only() -> No
         stage: Any = flight
         stage.simulated, stage.is_px4 = flight.copter, False
         components_of(stage)
-        with pytest.raises(NotSupported, match="ArduCopter has no action RETRACT"):
-            await flight.vehicle.winch().retract()
+        for component_id in (None, 1):  # 1 is the autopilot's own component id.
+            with pytest.raises(NotSupported, match="ArduCopter has no action RETRACT"):
+                await flight.vehicle.winch(component_id=component_id).retract()
         await flight.vehicle.winch(component_id=169).retract()
         assert [sent.target_component for sent in flight.wire.commands(C.DO_WINCH)] == [169]
 

@@ -293,7 +293,7 @@ class GimbalRequests:
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
         if self._may_control(sender_of(message), message.gimbal_device_id):
-            # All values are from -1 to 1: fractions of the limits and of the slew rate. PX4 takes such angles as radians
+            # All values are from -1 to 1: fractions of the limits and of the slew rate. PX4 takes the angles as radians
             # (input_mavlink.cpp, _process_set_manual_control), against the specification.
             _, pitch_limits, yaw_limits = self._gimbal.limits
             angles = (0.0, _scaled(message.pitch, pitch_limits), _scaled(message.yaw, yaw_limits))

@@ -9,7 +9,7 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavWinchStatusFlag, WinchActions
-from aerokit.vehicle.commanding.simple_orders import Effect, Firmware, SimpleOrder, receive_once
+from aerokit.vehicle.commanding.simple_orders import Effect, SimpleOrder, receive_once
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,8 +26,6 @@ LENGTH_TOLERANCE_M = 0.1
 RATE_TOLERANCE_M_S = 0.05
 ACTION_TIMEOUT_S = 120.0
 MAX_LENGTH_M, MAX_RATE_M_S = 1000.0, 20.0
-# PX4's MAVLink module passes DO_WINCH on, but no other module handles it.
-NO_WINCH: tuple[Firmware, ...] = ("PX4", "ArduPlane", "Rover", "ArduSub")
 
 
 @checks_arguments
@@ -207,7 +205,7 @@ class Winch(ReadOnly):
         self._check_supported(action)
         params = (self._number, action, length_m, rate_m_s)
         effect = None if is_done is None else Effect("WinchStatus", is_done)
-        await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect, NO_WINCH).send(
+        await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
             self._context,
             device_order=order,
             topic=self._topic,
@@ -217,6 +215,6 @@ class Winch(ReadOnly):
 
     def _check_supported(self, action: WinchActions) -> None:
         autopilot = self._context.session.autopilot
-        is_supported = autopilot.firmware not in NO_WINCH and action in autopilot.winch_actions
-        if self._component_id is None and not is_supported:
+        is_for_autopilot = self._component_id in (None, self._context.session.component_id)
+        if is_for_autopilot and action not in autopilot.winch_actions:
             raise NotSupported(f"winch: {autopilot.firmware} has no action {action.name}; nothing was sent")
