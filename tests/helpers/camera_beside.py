@@ -21,7 +21,6 @@ def camera_of(stage: Stage) -> SimulatedCamera:
     if camera is None:
         camera = SimulatedCamera()
         camera.join(simulated)
-        camera._power_on()
         simulated.components = (*simulated.components, camera)
     camera.faults = Faults()
     camera.files.put(DEFINITION_PATH, own_definition())

@@ -296,14 +296,32 @@ def test_faults_apply_to_the_component_only() -> None:
     assert client.ask(CAMERA, START, 0, 0, 1) == DONE
 
 
+@pytest.mark.parametrize("make", [SimulatedPx4, SimulatedCopter])
+def test_reboot_of_autopilot_does_not_reboot_camera(make: type[SimulatedVehicle]) -> None:
+    camera = SimulatedCamera()
+    client = settled(make(components=[camera]))  # type: ignore[call-arg]
+    client.ask(CAMERA, START, 0, 0.5, 0)
+    client.run(1.3)
+    client.ask(1, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1)
+    client.clear()
+    client.run(0.5)
+    client.clear()
+    client.run(0.5)
+    assert not client.messages_from(CAMERA, m.Heartbeat)  # The autopilot forwards nothing while it reboots.
+    client.run(8.7)
+    assert camera.image_count == 22
+    assert client.messages_from(CAMERA, m.CameraImageCaptured)
+    assert camera.time_boot_ms > client.vehicle.time_boot_ms
+
+
 def test_reboot_ends_series_and_keeps_images() -> None:
     camera, client = fitted()
     client.ask(CAMERA, START, 0, 0.5, 0)
     client.run(1.3)
     taken = camera.image_count
     assert taken == 3
-    client.ask(1, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1)
-    client.run(6.0)
+    camera.reboot()
+    client.run(6.3)
     assert camera.image_count == taken
     assert client.ask(CAMERA, START, 0, 0, 1) == DONE
     client.clear()

@@ -223,3 +223,14 @@ def test_reboot_resets_to_stick_control(client: Client) -> None:
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == ACCEPTED
     client.run(10.0)
     assert angles(client) == [0, -35, 0]
+
+
+def test_reboot_with_own_silence_resets_gimbal_and_devices(client: Client) -> None:
+    copter = client.vehicle
+    assert isinstance(copter, SimulatedCopter)
+    mount(client, MavMountMode.MAVLINK_TARGETING, -45)
+    copter.camera.image_count, copter.devices.line_m = 5, 5.0
+    copter.reboot(1.0)
+    client.run(9.0)
+    assert angles(client) == [0, -35, 0]
+    assert (copter.camera.image_count, copter.devices.line_m) == (0, 0.0)

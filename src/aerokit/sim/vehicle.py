@@ -10,7 +10,7 @@ import math
 import random
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from random import Random
 from typing import Any, Protocol
 
@@ -117,8 +117,8 @@ class SimulatedVehicle:
         self.handlers: dict[int, Handler] = {}
         """Handlers by message id."""
         self._observers: dict[int, list[Handler]] = {}
-        # Heap of (due time, number, function). The numbers keep the order of timers that are due at the same time.
-        self._timers: list[tuple[float, int, Callable[[], None]]] = []
+        # Heap of (due time, number, function, owner). The numbers keep the order of timers with the same due time.
+        self._timers: list[tuple[float, int, Callable[[], None], object]] = []
         self._timer_count = 0
         self._first_tick_at = self._next_tick_at = math.inf  # infinity while the vehicle does not tick
         self._ticks_done = 0  # since `_first_tick_at`, in units of TICK_S
@@ -181,7 +181,7 @@ class SimulatedVehicle:
             return self.now + TICK_S  # `step` must be called even if nothing happens, because it advances the time.
         due = self._next_tick_at
         if self._timers:
-            timer_due, _, _ = self._timers[0]
+            timer_due, _, _, _ = self._timers[0]
             if timer_due < due:
                 due = timer_due
         for channel in self.channels:
@@ -207,6 +207,11 @@ class SimulatedVehicle:
     def time_boot_us(self) -> int:
         return int((self.now - self.booted_at) * 1e6)
 
+    @property
+    def is_on(self) -> bool:
+        """False before the power-on and during a reboot."""
+        return self._is_on
+
     def power_on(self) -> None:
         """Boot now."""
         self.booted_at = self.now
@@ -224,9 +229,13 @@ class SimulatedVehicle:
             action()
 
     def reboot(self, silence_s: float) -> None:
-        """Stop sending, clear stream rates and timers, and boot again after ``silence_s`` seconds."""
+        """Stop sending, clear stream rates and timers, and boot again after ``silence_s`` seconds.
+
+        Components have their own power supply and keep running, but the vehicle forwards none of their messages
+        meanwhile.
+        """
         self._is_on = False
-        self._timers.clear()
+        self.cancel_timers(owner=None)
         self.set_ticking(False)
         for channel in self.channels:
             channel.reset()
@@ -256,17 +265,24 @@ class SimulatedVehicle:
         """
         return False
 
-    def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time. A reboot cancels the call."""
+    def call_at(self, when: float, action: Callable[[], None], *, owner: object = None) -> None:
+        """Call a function at a simulated time. A reboot of the owner, a component or None (the vehicle), cancels it."""
         self._timer_count += 1
-        heappush(self._timers, (when, self._timer_count, action))
+        heappush(self._timers, (when, self._timer_count, action, owner))
+
+    def cancel_timers(self, owner: object) -> None:
+        """Cancel all calls that were scheduled for this owner."""
+        self._timers = [timer for timer in self._timers if timer[-1] is not owner]
+        heapify(self._timers)
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
         """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
         self.call_at(self.now + delay, action)
 
-    def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:
-        """Call a function every ``interval`` seconds. A reboot cancels all further calls.
+    def every(
+        self, interval: float, action: Callable[[], None], *, first: float | None = None, owner: object = None
+    ) -> None:
+        """Call a function every ``interval`` seconds. A reboot of the owner, see `call_at`, cancels all further calls.
 
         ``first`` is the delay of the first call in seconds; None means ``interval``.
         """
@@ -280,10 +296,10 @@ class SimulatedVehicle:
                 start += late_s
             count += 1
             # The next call is scheduled first, so that an action that reboots the vehicle cancels it.
-            self.call_at(round((start + count * interval) * NS_PER_S) / NS_PER_S, repeat)
+            self.call_at(round((start + count * interval) * NS_PER_S) / NS_PER_S, repeat, owner=owner)
             action()
 
-        self.call_at(start, repeat)
+        self.call_at(start, repeat, owner=owner)
 
     def set_ticking(self, ticking: bool) -> None:
         """Start or stop the calls of `tick`. Their rate is 50 Hz, and in steady flight at least 8 Hz."""
@@ -317,7 +333,7 @@ class SimulatedVehicle:
     def _run_due(self, due: float) -> None:
         self._tick_until(due)
         while self._timers and self._timers[0][0] <= due:
-            _, _, action = heappop(self._timers)
+            _, _, action, _ = heappop(self._timers)
             action()
         for channel in self.channels:
             if channel.streams.next_due <= due:
@@ -332,7 +348,7 @@ class SimulatedVehicle:
         if delay <= 0:
             return
         self.now = now
-        self._timers = [(when + delay, count, action) for when, count, action in self._timers]
+        self._timers = [(when + delay, count, action, owner) for when, count, action, owner in self._timers]
         self._first_tick_at += delay
         self._schedule_tick(1)
         for channel in self.channels:

@@ -276,13 +276,17 @@ class ArduPilotVehicle(ArduPilotHost):
         self.requests.start_channel(channel, max(self.now, ready_at))
 
     def restart(self) -> None:
-        """Reboot: send nothing for a while, then boot again. Stream rates and estimates are reset."""
+        """Reboot, with the silence of the real firmware."""
+        self.reboot(_REBOOT_SILENCE_S)
+
+    def reboot(self, silence_s: float) -> None:
+        """See `SimulatedVehicle.reboot`. Resets estimates and the autopilot's own devices, such as its gimbal."""
         self.parameters["STAT_BOOTCNT"] += 1
         self.motion.settle()  # After a reboot in flight, the vehicle is on the ground at once.
         self._reset()
         for channel in self.channels:
             channel.closes_clients = True  # The reboot also ends the TCP server of the firmware.
-        self.reboot(_REBOOT_SILENCE_S)
+        super().reboot(silence_s)
 
     def send_text(self, severity: int, text: str) -> None:
         """Send a text after the answer to the present command. During the boot, send it at once, like the firmware."""

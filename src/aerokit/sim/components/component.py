@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -54,7 +55,7 @@ def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpSer
     from aerokit.sim.px4.ftp import Px4Ftp  # imported only when needed, because most components serve no files
 
     server = Px4Ftp(component, files)
-    component.vehicle.on_power_on(server.restart)
+    component.on_power_on(server.restart)
     return server
 
 
@@ -63,7 +64,7 @@ _MAVLINK_VERSION = 3
 
 
 class SimulatedComponent:
-    """Base of a device on a vehicle's links. The device is switched on and rebooted together with the vehicle.
+    """Base of a device on a vehicle's links. The device is switched on with the vehicle, but does not reboot with it.
 
     The component receives broadcasts, and messages that are addressed to it. An unknown command is UNSUPPORTED if it is
     addressed to the component, and ignored if it is a broadcast. The component's `faults` apply in addition to those of
@@ -81,6 +82,8 @@ class SimulatedComponent:
         """Faults of the component: commands, ``silent``, ``heartbeats_stopped``, losses."""
         self._system_id = system_id
         self._vehicle: SimulatedVehicle | None = None
+        self._booted_at = math.nan
+        self._at_power_on: list[Callable[[], None]] = []
         self._commands: dict[int, CommandHandler] = {}
         self._streams: MessageStreams = MessageStreams(self)
 
@@ -96,7 +99,7 @@ class SimulatedComponent:
         """Called when the component joins a vehicle: register handlers of messages other than commands with `on`."""
 
     def start(self) -> None:
-        """Called at power-on: reset, and start the default streams."""
+        """Called at power-on and at each `reboot`: reset, and start the default streams."""
 
     @property
     def vehicle(self) -> SimulatedVehicle:
@@ -119,8 +122,8 @@ class SimulatedComponent:
 
     @property
     def time_boot_ms(self) -> int:
-        """Milliseconds since the vehicle booted."""
-        return self.vehicle.time_boot_ms
+        """Milliseconds since the component booted."""
+        return int((self.now - self._booted_at) * 1000.0) & 0xFFFFFFFF
 
     def join(self, vehicle: SimulatedVehicle) -> None:
         """Add the component to a vehicle. The vehicle calls this method."""
@@ -131,12 +134,25 @@ class SimulatedComponent:
         self._commands = {**self._streams.commands(), **self.commands()}
         CommandServer(self, self._commands)
         self.listen()
-        vehicle.on_power_on(self._power_on)
+        vehicle.on_power_on(self._on_vehicle_power_on)
 
-    def _power_on(self) -> None:
+    def _on_vehicle_power_on(self) -> None:
+        if math.isnan(self._booted_at):  # When the vehicle reboots, the component keeps running.
+            self.reboot()
+
+    def reboot(self) -> None:
+        """Boot now, also for the first time."""
+        self.vehicle.cancel_timers(self)
+        self._booted_at = self.now
         self._streams.clear()
-        self.vehicle.every(_HEARTBEAT_INTERVAL_S, self._send_heartbeat)
+        self.vehicle.every(_HEARTBEAT_INTERVAL_S, self._send_heartbeat, owner=self)
         self.start()
+        for action in self._at_power_on:
+            action()
+
+    def on_power_on(self, action: Callable[[], None]) -> None:
+        """Call a function at each boot of the component."""
+        self._at_power_on.append(action)
 
     def _send_heartbeat(self) -> None:
         self.send(
@@ -160,7 +176,8 @@ class SimulatedComponent:
 
     def send(self, message: Message, channel: Channel | None = None) -> None:
         """Send a message on one channel, or on all channels if ``channel`` is None."""
-        if not (self.faults.frozen or self.faults.drops_outgoing(message, self.vehicle.rng)):
+        is_forwarded = self.vehicle.is_on and not self.faults.frozen
+        if is_forwarded and not self.faults.drops_outgoing(message, self.vehicle.rng):
             self.vehicle.send(message, channel, (self.system_id, self.component_id))
 
     def send_text(self, severity: int, text: str) -> None:
@@ -168,12 +185,12 @@ class SimulatedComponent:
         self.send(Statustext(severity, text[:50], id=0, chunk_seq=0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
-        self.vehicle.call_later(delay, action)
+        """Call a function after ``delay`` simulated seconds. A reboot of the component cancels the call."""
+        self.call_at(self.now + delay, action)
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Call a function at a simulated time. A reboot cancels the call."""
-        self.vehicle.call_at(when, action)
+        """Call a function at a simulated time. A reboot of the component cancels the call."""
+        self.vehicle.call_at(when, action, owner=self)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:
         """Stream messages on one channel, or on all channels if ``channel`` is None. The interval 0 stops them."""

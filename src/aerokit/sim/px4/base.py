@@ -228,16 +228,19 @@ class Px4Vehicle(Px4Host):
         self.call_at(ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel))
 
     def restart(self) -> None:
+        self.reboot(_REBOOT_SILENCE_S)
+
+    def reboot(self, silence_s: float) -> None:
         self.motion.down = self.motion.ground_down
         self.motion.settle()
         self._reset()
         self._next_text_id = 0
-        self.reboot(_REBOOT_SILENCE_S)
+        super().reboot(silence_s)
 
     def shut_down(self) -> None:
         """Switch off until `power_on`."""
         self._reset()
-        self.reboot(math.inf)
+        super().reboot(math.inf)
 
     def send_text(self, severity: int, text: str) -> None:
         """Queue a status text and its event, if it has one. They are sent after the answer to the present command."""
