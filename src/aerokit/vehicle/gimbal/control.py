@@ -39,12 +39,11 @@ FINAL_MESSAGE_COUNT, FINAL_MESSAGE_INTERVAL_S = 5, 0.1
 
 
 class ReleaseCommand:
-    """The last command of a block, which stops or releases a gimbal. Sent at once, and retried in the background.
+    """The command that stops or releases a gimbal at the end of a block. It is repeated until it is acknowledged.
 
-    If the vehicle is silent, the command is sent at the next HEARTBEAT. ``is_still_due`` is checked before each
-    attempt, so that the command does not undo a newer order or the control of another station. If the gimbal manager
-    has fallen silent, the command is sent once more at its next HEARTBEAT. ``final_message`` is sent several times
-    after the acknowledgement.
+    ``is_still_due`` is checked before each transmission, so that the command does not undo a newer order or the control
+    of another station. If the vehicle or the gimbal manager is silent, the command is sent at the next HEARTBEAT.
+    ``final_message`` is sent several times after the acknowledgement.
     """
 
     def __init__(
@@ -251,7 +250,7 @@ class GimbalControl:
         orders = self._orders
         if self._was_entered:
             raise BusyError("a GimbalControl can be entered only once: call control() again")
-        if self._is_primary in orders.device.control_blocks:  # The keys are True for primary, False for secondary.
+        if orders.device.has_control_block(is_primary=self._is_primary):
             raise BusyError(f"{orders.name}: another block of this program already has control; nothing was sent")
         if not self._is_primary and not orders.rules.has_secondary:
             raise orders.not_supported("has no secondary control")
@@ -266,7 +265,7 @@ class GimbalControl:
             await self._request_control()
             await self._await_confirmation(since)
         except (CommandRejected, NotSupported, BusyError):
-            # Control was not obtained. If an earlier block has left its release to this block, the release is due now.
+            # Control was not obtained. Another block may have ended meanwhile without releasing the same control.
             self._end()
             if self._control_request.must_release:
                 release.send_soon()
@@ -297,7 +296,7 @@ class GimbalControl:
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary)
         try:
-            await orders.send(None, CONFIGURE, *params)  # None, because the command is not part of an order.
+            await orders.send(None, CONFIGURE, *params)
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
                 raise orders.not_supported("has no gimbal manager whose control could be taken") from error
@@ -324,10 +323,10 @@ class GimbalControl:
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device
         # During the wait, another block may have been entered, or another gimbal may have become the first one.
-        if self._is_primary in device.control_blocks:
+        if device.has_control_block(is_primary=self._is_primary):
             raise BusyError(f"{orders.name}: another block of this program already has control")
         self._device = device
-        device.control_blocks[self._is_primary] = self
+        device.control_blocks.append(self)
         self._detach_callbacks.append(device.controllers.observe(self._on_controllers, every_arrival=True))
 
     def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
@@ -374,8 +373,8 @@ class GimbalControl:
         requests = self._orders.registry.control_requests
         if self._control_request in requests:
             requests.remove(self._control_request)
-        if self._device is not None and self._device.control_blocks.get(self._is_primary) is self:
-            del self._device.control_blocks[self._is_primary]
+        if self._device is not None and self in self._device.control_blocks:
+            self._device.control_blocks.remove(self)
         for detach in self._detach_callbacks:
             detach()
         self._detach_callbacks.clear()

@@ -136,8 +136,8 @@ def _version(number: int) -> str:
 # Gimbals without their own component id are numbered from 1 to this.
 MAX_GIMBAL_NUMBER = 6
 
-# A status whose time stamp is lower than the newest one arrived late. If it is lower by this many milliseconds or more,
-# the manager has rebooted.
+# A status with a lower time stamp than the newest status arrived late. If the time stamp is lower by this many
+# milliseconds or more, the manager has rebooted instead.
 REORDER_WINDOW_MS = 5_000
 
 ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
@@ -145,6 +145,9 @@ ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
 
 class ControlBlock(Protocol):
     """Interface of the ``async with`` blocks that control a gimbal."""
+
+    @property
+    def is_primary(self) -> bool: ...
 
     @property
     def is_held(self) -> bool: ...
@@ -169,8 +172,8 @@ class GimbalDevice:
         self.failures: int = 0  # the latest GIMBAL_DEVICE_ERROR_FLAGS
         self.manager_information: GimbalManagerInformation | None = None
         self.device_information: GimbalDeviceInformation | None = None
-        # Open control blocks: primary (True) and secondary (False).
-        self.control_blocks: dict[bool, ControlBlock] = {}
+        # Open control blocks: at most one with primary and one with secondary control.
+        self.control_blocks: list[ControlBlock] = []
         # True once the program has requested the limits. Orders beyond the limits are then refused.
         self.checks_limits = False
         self.reboots: int = 0  # number of reboots of the vehicle so far
@@ -210,6 +213,9 @@ class GimbalDevice:
     @property
     def device_id(self) -> int:
         return self.number or self.component_id
+
+    def has_control_block(self, *, is_primary: bool) -> bool:
+        return any(block.is_primary is is_primary for block in self.control_blocks)
 
     @property
     def is_in_use(self) -> bool:
@@ -288,7 +294,7 @@ class ControlRequest:
         self.manager_id: int = manager_id
         self.gimbal_id_param: int = gimbal_id_param
         self.is_primary: bool = is_primary
-        # True if an earlier block left the release of control to this block, because both requested the same control.
+        # True if another block with the same control has ended, and has left the release to the block of this request.
         self.must_release = False
 
     def is_released_with(self, other: ControlRequest) -> bool:

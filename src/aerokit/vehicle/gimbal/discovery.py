@@ -32,7 +32,8 @@ UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
 HEADING_MAX_AGE_S = 5.0
 # A component counts as gone if it is silent for this many seconds while the autopilot is not.
 MAX_SILENCE_S = 10.0
-# Precedence of managers, by the message that shows that a component is one. The autopilot always has the highest rank.
+# If several components send the messages of a gimbal manager, the one with the highest rank gets the orders. The rank
+# depends on the message; the autopilot always has the highest.
 RANK_STATUS, RANK_INFORMATION, RANK_AUTOPILOT = 1, 2, 3
 
 
@@ -182,7 +183,6 @@ class GimbalRegistry:
         if frame is None:
             return None
         sender = frame.component_id
-        # If several components send messages as the manager of a gimbal, orders go to the one of the highest rank.
         rank = RANK_INFORMATION if isinstance(message, GimbalManagerInformation) else RANK_STATUS
         if sender == self._session.component_id:
             rank = RANK_AUTOPILOT

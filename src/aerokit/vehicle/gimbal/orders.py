@@ -112,7 +112,7 @@ class GimbalOrders:
         return f"gimbal {self.device.device_id}" if self.device.component_id else "the gimbal"
 
     async def send(self, order: Order | None, command: int, *params: float) -> None:
-        """Send a COMMAND_LONG to the manager, as a part of ``order`` or as an order of its own."""
+        """Send a COMMAND_LONG to the manager, as a part of ``order``. None: the command belongs to no other order."""
         with self.context.arbiter.auxiliary_order(order) as sent_order:
             await self.context.sender.send_long(sent_order, command, *params, component_id=self.manager_id)
 
@@ -272,7 +272,7 @@ class GimbalOrders:
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        # PX4 takes the value -2 ("the sender") for PX4 itself, so our ids are sent.
+        # The value -2 means the sender of the command, but gives control to PX4 itself (input_mavlink.cpp).
         controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         primary, secondary = (controller, unchanged) if is_primary else (unchanged, controller)
@@ -301,13 +301,12 @@ class GimbalOrders:
 
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if the open control blocks have lost control."""
-        blocks = self.device.control_blocks.values()
-        if not any(block.is_held for block in blocks):
-            for block in blocks:
+        if self.is_taken:
+            for block in self.device.control_blocks:
                 block.raise_if_taken()
 
     def raise_if_refused(self, description: str, since: float) -> None:
-        """Raise CommandRejected if the manager has refused a command after ``since``, when it counted as accepted."""
+        """Raise CommandRejected if the manager has refused an order that counted as accepted from ``since`` on."""
         for command in AIMING_COMMANDS:
             result = self.session.commands.late_refusal(command, self.manager_id, since)
             if result is not None:
@@ -315,7 +314,7 @@ class GimbalOrders:
 
     @property
     def is_taken(self) -> bool:
-        blocks = self.device.control_blocks.values()
+        blocks = self.device.control_blocks
         return bool(blocks) and not any(block.is_held for block in blocks)
 
     def not_supported(self, predicate: str) -> NotSupported:

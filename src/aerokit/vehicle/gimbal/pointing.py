@@ -78,7 +78,7 @@ class RestTarget:
     """Target of an order: the gimbal stands still in its retracted or neutral position.
 
     ``flag`` is the GIMBAL_DEVICE_FLAGS bit that reports this position. Some gimbals do not report it. With
-    ``accepts_ahead``, level and straight ahead is accepted as the position too.
+    ``accepts_ahead``, a gimbal that is level and points straight ahead counts as being in this position.
     """
 
     def __init__(self, flag: int, *, accepts_ahead: bool) -> None:

@@ -69,7 +69,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._order: Order | None = None
         # The error that describes the loss of control; None until control is lost.
         self._taken: AerokitError | None = None
-        # Until it is closed, the gimbal is in use, so that ``vehicle.gimbal`` does not change to another gimbal.
+        # Marks the gimbal as in use until it is closed, so that ``vehicle.gimbal`` does not become another gimbal.
         self._cleanup = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
@@ -180,7 +180,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         def is_still_due() -> bool:
             return order is not None and order.is_newest and not orders.is_taken
 
-        # The command may overtake a message with an earlier rate, so a message with a rate of zero follows.
+        # The command may overtake a message with an earlier rate, so messages with a rate of zero follow.
         return ReleaseCommand(orders, PITCHYAW, params, is_still_due, final_message=self._encode_rates((0.0, 0.0)))
 
     def _finish(self) -> None:
