@@ -99,7 +99,7 @@ class CaptureLog:
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
         self._failed: _Entry | None = None  # the last failed picture
         # Number of pictures according to CAMERA_CAPTURE_STATUS and to indices, and the time since boot at which the
-        # camera reported it. `_has_nonzero_count` is False until the camera has reported a number above 0.
+        # camera reported it. The number stays 0 for a camera that always reports 0.
         self._count = 0
         self._count_boot_ms = 0
         self._has_nonzero_count = False

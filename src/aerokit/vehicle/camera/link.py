@@ -93,7 +93,7 @@ class CameraLink(CameraOrders):
 
     @property
     def video_stream(self) -> int:
-        """Stream id for recording commands. 0 means all streams."""
+        """Stream id for recording commands; 0 means all streams. ArduPilot takes it for the number of the camera."""
         return self.device_id if self._session.autopilot.video_addresses_camera else 0
 
     @property
@@ -129,7 +129,7 @@ class CameraLink(CameraOrders):
         return f"camera {self.number}{f' ({model})' if model else ''}"
 
     def bind(self, number: int, *, is_guess: bool = False) -> None:
-        """Address this camera from now on. A later call can only replace a guess to which no order was given."""
+        """Address this camera from now on. Later calls do nothing, unless this number is a guess that got no order."""
         has_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
         if self._is_found.is_set() or has_orders:
             return
@@ -325,8 +325,7 @@ class ActiveOperation:
         try:
             yield
         except BaseException as error:
-            was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
-            if not was_sent or was_refused:
+            if not self.order.was_sent or isinstance(error, CommandRejected):
                 self.order.withdraw()
                 self.discard()
             else:  # The camera may have started nevertheless.
@@ -350,7 +349,7 @@ class ActiveOperation:
 
     def _finish(self) -> None:
         # The vehicle's `async with` block ends, so there is no time to wait for an answer.
-        is_active = self.order.may_move and self.order.is_newest
+        is_active = self.order.was_sent and self.order.is_newest
         self.discard()
         if is_active:
             command, *params = self._stop_command()

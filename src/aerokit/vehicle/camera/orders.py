@@ -145,7 +145,7 @@ class CameraOrders:
         if order is not None and not order.is_newest:
             raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}", was_sent=False)
         if order is not None and not self._session.is_closed:
-            order.may_move = True  # From here on, the camera may execute the order.
+            order.was_sent = True
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
         ends_with_actions = attempts != 1 and not is_stop
@@ -218,14 +218,7 @@ class CameraOrders:
 
         async def confirm() -> None:
             try:
-                if order.is_newest:
-                    try:
-                        await self.command(command, *params, order=order, is_stop=True, was_just_sent=True)
-                    except CommandTimeout:
-                        if is_awaited:
-                            raise
-                        await self._session.wait_for_heartbeat()  # The command may have been lost in a silence.
-                        await self.command(command, *params, order=order, is_stop=True)
+                await self._confirm_stop(order, command, *params, is_awaited=is_awaited)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:
@@ -244,6 +237,18 @@ class CameraOrders:
         await answered.wait()
         if errors:
             raise errors[0]
+
+    async def _confirm_stop(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
+        """Wait for the acknowledgement of a stop command that was just sent, and repeat the command if necessary."""
+        if not order.is_newest:
+            return
+        try:
+            await self.command(command, *params, order=order, is_stop=True, was_just_sent=True)
+        except CommandTimeout:
+            if is_awaited:
+                raise
+            await self._session.wait_for_heartbeat()  # The command may have been lost in a silence.
+            await self.command(command, *params, order=order, is_stop=True)
 
 
 # A state value is polled for this many seconds after the program has read it.

@@ -47,7 +47,7 @@ class Shutter:
         self._sequence_number = 0  # sequence number of the photo that was ordered last
         self._lock = anyio.Lock()
         self._reports_status = False  # True once the camera has sent CAMERA_CAPTURE_STATUS
-        self._never_answered = False  # True if, for some order, no request for CAMERA_CAPTURE_STATUS was answered
+        self._ignored_requests = False  # True once all requests for this message before an order were unanswered
 
     async def request_status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
         """Request CAMERA_CAPTURE_STATUS; None if the camera does not send it."""
@@ -61,13 +61,13 @@ class Shutter:
         # The answer decides whether an order may be sent again, so the request is repeated. A camera that has never
         # sent its status may not support the message, so it gets fewer requests: FIRST_STATUS_ATTEMPTS for the first
         # order, and only one for later orders.
-        attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
+        attempts_before_first = 1 if self._ignored_requests else FIRST_STATUS_ATTEMPTS
         attempts = STATUS_ATTEMPTS if self._reports_status else attempts_before_first
         for _ in range(attempts):
             status = await self.request_status(STATUS_TIMEOUT_S)
             if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
                 return status
-        self._never_answered = not self._reports_status
+        self._ignored_requests = not self._reports_status
         return None
 
     async def take_photo(self, timeout: float) -> Capture:
@@ -320,31 +320,39 @@ class PhotoInterval:
     def _collect(self) -> None:
         while capture := self._new_captures.pop():
             first = self._first_after_reset(capture)
-            if first is not None:  # The series goes on with the new indices.
-                self._known_reset_at = self._log.reset_at
-                self._next_index = first.index
-                self._is_start_guessed = False
-                self._set_newest(first.index)
-                self._waiting = {first.index: first}
+            if first is not None:
+                self._continue_after_reset(first)
             # Without a status, the index of the first capture counts as the start of the series. A later capture with a
             # much lower index shows that this index was corrupt, and counts as the start instead.
             if self._next_index is None or self._contradicts_guess(capture.index):
-                self._is_start_guessed = self._next_index is None  # A corrected start is not corrected again.
-                self._next_index = capture.index
-                self._waiting.clear()  # It may contain the capture with the corrupt index.
-                # One less than the index of this capture, so that the comparison at the end of the loop accepts it.
-                self._newest_index = capture.index - 1
-            if not self._is_plausible(capture.index):
-                continue
-            # A failed capture is not stored by its index, because a later picture may have the same index.
-            if capture.success is False:
-                self._failed.append(capture)
-            elif capture.index >= self._next_index:
-                self._waiting[capture.index] = capture
-                if capture.index > self._newest_index:
-                    if self._delivered:  # A higher index than that of a delivered capture confirms the start.
-                        self._is_start_guessed = False
-                    self._set_newest(capture.index)
+                self._guess_start(capture.index)
+            if self._is_plausible(capture.index):
+                self._add(capture)
+
+    def _continue_after_reset(self, first: Capture) -> None:
+        """Continue the series with the new indices, of which ``first`` has the lowest."""
+        self._known_reset_at = self._log.reset_at
+        self._next_index = first.index
+        self._is_start_guessed = False
+        self._set_newest(first.index)
+        self._waiting = {first.index: first}
+
+    def _guess_start(self, index: int) -> None:
+        self._is_start_guessed = self._next_index is None  # A corrected start is not corrected again.
+        self._next_index = index
+        self._waiting.clear()  # It may contain the capture with the corrupt index.
+        self._newest_index = index - 1  # One less, so that `_add` accepts the capture as the newest one.
+
+    def _add(self, capture: Capture) -> None:
+        # A failed capture is not stored by its index, because a later picture may have the same index.
+        if capture.success is False:
+            self._failed.append(capture)
+        elif self._next_index is not None and capture.index >= self._next_index:
+            self._waiting[capture.index] = capture
+            if capture.index > self._newest_index:
+                if self._delivered:  # A higher index than that of a delivered capture confirms the start.
+                    self._is_start_guessed = False
+                self._set_newest(capture.index)
 
     def _set_newest(self, index: int) -> None:
         self._newest_index = index

@@ -361,7 +361,7 @@ async def _read_json(component: Component, uri: str) -> dict[str, Any]:
         raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
     try:
         data = decompress(await component.fetch(uri), uri)
-    except InvalidArgument as error:  # The address is the component's, so this is no error of the caller.
+    except InvalidArgument as error:  # The component, not the caller, has chosen the address.
         raise NotSupported(f"component {component.component_id}: {error}") from None
     try:
         content = json.loads(data.decode("utf-8-sig"))

@@ -105,23 +105,24 @@ class Winch(ReadOnly):
         )
 
     def _has_paid_out(self, status_before: m.WinchStatus, length_m: float) -> Callable[[m.WinchStatus], bool]:
-        """Return a function that returns True for a status which reports that the length was paid out.
+        """Return a predicate that is True for a WINCH_STATUS which reports that ``length_m`` was paid out.
 
-        The winch pays out ``length_m`` from the length of its line at the time when it gets the command. If it was
-        turning, this length is not known exactly.
+        The winch adds ``length_m`` to the length of its line at the time when it gets the command. If it was turning,
+        that length is not known exactly.
         """
         frame, now = status_before.received_frame, self._context.session.connection.now
         reported_at = now() if frame is None else frame.received_at
         was_turning = abs(status_before.speed) > RATE_TOLERANCE_M_S
-        turned_m: float | None = None
+        max_drift_m: float | None = None
 
         def has_paid_out(status: m.WinchStatus) -> bool:
-            nonlocal turned_m
-            if turned_m is None:
-                turned_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
+            nonlocal max_drift_m
             # The winch got the command between `status_before` and the first status after the acknowledgement.
-            start_m = status.line_length - length_m - status_before.line_length
-            is_near = abs(start_m - turned_m / 2) <= abs(turned_m / 2) + LENGTH_TOLERANCE_M
+            if max_drift_m is None:
+                max_drift_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
+            drift_m = status.line_length - length_m - status_before.line_length
+            lowest_m, highest_m = sorted((0.0, max_drift_m))
+            is_near = lowest_m - LENGTH_TOLERANCE_M <= drift_m <= highest_m + LENGTH_TOLERANCE_M
             return is_near and (not was_turning or abs(status.speed) <= RATE_TOLERANCE_M_S)
 
         return has_paid_out
