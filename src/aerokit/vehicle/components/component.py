@@ -258,24 +258,9 @@ class Component(ReadOnly):
         """
         subscriber = self._session.subscriber
         with subscriber.subscribe((message_type,), capacity=100, overflow="drop_oldest", rate_hz=None) as answers:
-            refusal: CommandRejected | None = None
             with anyio.move_on_after(timeout):
-                commands = self._session.commands
                 for attempts_left in reversed(range(REQUEST_ATTEMPTS)):
-                    may_get_late_ack = commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, self.component_id)
-                    try:
-                        await commands.send_long(
-                            MavCmd.REQUEST_MESSAGE,
-                            message_type.ID,
-                            *params,
-                            component_id=self.component_id,
-                            attempts=1,
-                        )
-                    except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
-                        pass
-                    except CommandRejected as error:
-                        # If the refusal may belong to an earlier request, it counts only after the last attempt.
-                        refusal = None if may_get_late_ack and attempts_left else error
+                    refusal = await self._request_once(message_type.ID, *params, is_last=not attempts_left)
                     if refusal is not None:
                         wait_s = 0.0  # Return the message only if it has arrived already.
                     elif attempts_left:
@@ -292,6 +277,19 @@ class Component(ReadOnly):
             f"component {self.component_id} sent no {message_type.NAME} within {timeout:g} s;"
             f" {self._session.describe_link()}"
         )
+
+    async def _request_once(self, message_id: int, *params: float, is_last: bool) -> CommandRejected | None:
+        """Request a message and return the refusal, if there is one."""
+        commands, command = self._session.commands, MavCmd.REQUEST_MESSAGE
+        may_get_late_ack = commands.may_get_late_ack(command, self.component_id)
+        try:
+            await commands.send_long(command, message_id, *params, component_id=self.component_id, attempts=1)
+        except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
+            return None
+        except CommandRejected as error:
+            # If the refusal may belong to an earlier request, it counts only after the last attempt.
+            return None if may_get_late_ack and not is_last else error
+        return None
 
     def subscribe(
         self,

@@ -273,6 +273,20 @@ class Settings:
         assert definition is not None
         # Before anything is sent, refuse a value that the known values of other settings exclude already.
         definition.checked(name, value, self._values())
+        await self._read_before_write(definition, setting_definition, idle_timeout_s)
+        # Check the value again, because the values that were just read may exclude or restrict this setting.
+        checked_value = definition.checked(name, value, self._values())
+        known = self._known.get(name)
+        wire_type = setting_definition.wire_type if known is None else known.type
+        old_value = None if known is None else known.value
+        raw_value = checked_setting(name, checked_value, wire_type)
+        return await self._write(name, raw_value, wire_type, old_value, idle_timeout_s)
+
+    async def _read_before_write(
+        self, definition: CameraDefinition, setting_definition: SettingDefinition, idle_timeout_s: float
+    ) -> None:
+        """Read the setting itself, and the settings that restrict it, if their values are unknown."""
+        name = setting_definition.name
         to_read = [
             setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])
         ]
@@ -284,13 +298,6 @@ class Settings:
                 self._missing.add(answered_name)
         if name in answers:
             _setting_or_raise(answers[name])  # Raise an error if the component does not have this setting.
-        # Check the value again, because the values that were just read may exclude or restrict this setting.
-        checked_value = definition.checked(name, value, self._values())
-        known = self._known.get(name)
-        wire_type = setting_definition.wire_type if known is None else known.type
-        old_value = None if known is None else known.value
-        raw_value = checked_setting(name, checked_value, wire_type)
-        return await self._write(name, raw_value, wire_type, old_value, idle_timeout_s)
 
     async def _write(
         self, name: str, value: SettingValue, wire_type: int, old_value: SettingValue | None, idle_timeout_s: float
