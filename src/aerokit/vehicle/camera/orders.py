@@ -149,7 +149,6 @@ class CameraOrders:
         session, started_at = self._session, self._session.connection.now()
         arbiter = self._context.arbiter
         ends_with_actions = attempts != 1 and not is_stop
-        # `sent.end` gives the reason once the command must no longer be repeated.
         with (
             arbiter.auxiliary_order(order, ends_with_actions=ends_with_actions) as sent_order,
             arbiter.sending(sent_order) as sent,

@@ -71,7 +71,6 @@ class Shutter:
         return None
 
     async def take_photo(self, timeout: float) -> Capture:
-        """Take one photo and return its capture. Raises as :meth:`Camera.take_photo`."""
         async with self._lock:
             series = self.link.latest_order("series")
             before = await self.request_status_reliably()
@@ -125,7 +124,6 @@ class Shutter:
         return None
 
     def _checked(self, capture: Capture) -> Capture:
-        """Return the capture; raise OperationRejected if the camera failed to take the picture."""
         if capture.success is False:
             raise OperationRejected(f"{self.link.describe()} could not take the picture")
         return capture

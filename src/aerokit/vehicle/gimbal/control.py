@@ -355,9 +355,7 @@ class GimbalControl:
         def is_still_due() -> bool:
             if self._taken is not None:
                 return False
-            # If other blocks need this control, they are marked, so that they release it when they end.
-            is_left_to_others = self._control_request.leave_release_to(requests)
-            return not is_left_to_others
+            return not self._control_request.leave_release_to(requests)
 
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 
