@@ -481,7 +481,7 @@ async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
         assert [order.target_component for order in orders] == [1, 100]
 
 
-@pytest.mark.parametrize("sign", ["report", "order", "number"])
+@pytest.mark.parametrize("sign", ["report", "status", "order", "number"])
 async def test_late_camera_does_not_replace_known_autopilot_camera(sign: str) -> None:
     camera = SimulatedCamera()
     camera.faults.heartbeats_stopped = True
@@ -491,6 +491,8 @@ async def test_late_camera_does_not_replace_known_autopilot_camera(sign: str) ->
             await first.wait_found()
         if sign == "report":
             flight.copter.send(m.CameraFeedback(0, 1, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0))
+        elif sign == "status":
+            flight.copter.send(m.CameraCaptureStatus(0, 0, 0, 0, 0, 1000, 5))
         elif sign == "order":
             flight.copter.faults.refuse(ZOOM, MavResult.ACCEPTED)
             await first.zoom_to(50)

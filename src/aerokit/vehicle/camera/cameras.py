@@ -295,9 +295,8 @@ class Cameras:
         if number not in numbers:
             source = Source(self._session.system_id, frame.component_id, message.NAME)
             self.cell.set(tuple(sorted((*numbers, number), key=_sort_key)), source)
-        # A camera with its own component id becomes `first`, unless another camera is known to be the first. A message
-        # of an autopilot's camera confirms the guess that this camera is the first.
-        if not has_autopilot_number or number == self._first_link.number:
+        # A camera with its own component id becomes `first`, unless another camera is known to be the first.
+        if not has_autopilot_number:
             self._first_link.bind(number)
         return int(number)
 
