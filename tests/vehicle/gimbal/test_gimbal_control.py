@@ -214,7 +214,7 @@ async def test_out_of_order_status_does_not_lose_control() -> None:
 
 
 @pytest.mark.parametrize("sequence", [7, 255])
-async def test_out_of_order_status_of_same_millisecond_does_not_lose_control(sequence: int) -> None:
+async def test_reordered_status_of_same_millisecond_keeps_control(sequence: int) -> None:
     gimbal = SimulatedGimbal()
     async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control() as control:
         encoder, now_ms = FrameEncoder(1, 154), gimbal.time_boot_ms
