@@ -82,7 +82,7 @@ def position_with_altitude(place: Position | Home) -> Position:
 
 
 def travel_target(place: Position | Home) -> Position:
-    """Return the position to fly to. That of a Home has no altitude, so the vehicle keeps its present one."""
+    """Return the position to fly to. For a Home it has no altitude, so that the vehicle keeps its present one."""
     return place.position if isinstance(place, Home) else place
 
 

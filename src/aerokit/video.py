@@ -40,7 +40,7 @@ class VideoFrame(Snapshot):
     """One video frame.
 
     - ``picture``: a PyAV frame: ``picture.to_ndarray(format="rgb24")`` (height, width, 3), ``picture.to_image()``
-    - ``received_at``: time on the loop's clock at which the frame was decoded (that of its reception is unknown)
+    - ``received_at``: time on the loop's clock at which the frame was decoded (when it was received is unknown)
     - ``stream_s``: time in the stream; None if the frame has none
     - ``position``, ``attitude``: the vehicle's latest values at ``received_at``; None without a vehicle, or if unknown
     """
@@ -64,8 +64,8 @@ async def open_video(
     """Open a video stream for the duration of an ``async with`` block.
 
     ``async with open_video(stream.uri, vehicle) as video: async for frame in video: …``. A slow reader always gets the
-    latest frame, and misses earlier ones. A thread decodes the stream. It ends with the block. If it is then waiting
-    for a frame, it ends at its next frame or time-out.
+    latest frame, and misses earlier ones. A thread decodes the stream until the block ends. A thread that is waiting
+    for a frame at that time ends at the next frame or time-out.
 
     Args:
         uri: anything that FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, the path of a file.

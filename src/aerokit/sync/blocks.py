@@ -1,4 +1,4 @@
-"""Base classes of the generated twins: how each is opened, entered, iterated and closed."""
+"""Base classes of the generated blocking twins: how each is opened, entered, iterated and closed."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 class BlockingContext:
-    """Base of objects that functions of :mod:`aerokit.sync` open.
+    """Base of the objects that ``connect`` and the other functions of :mod:`aerokit.sync` open.
 
     Using one with ``await`` or ``async with`` closes it and raises TypeError.
     """
@@ -75,7 +75,7 @@ class BlockingContext:
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         self.close()
 
-    if not TYPE_CHECKING:  # Hidden from type checkers, so that they report `await` and `async with`.
+    if not TYPE_CHECKING:  # Hidden from type checkers, so that they report `await` and `async with` as errors.
 
         def __await__(self) -> NoReturn:
             self._misused("await")
@@ -155,7 +155,7 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name.startswith("_"):  # The module copy reads such names before `self.aio` exists.
+            if name.startswith("_"):  # `copy.copy` reads such names before `self.aio` exists.
                 raise AttributeError(name)
             return getattr(self.aio, name)  # The cell raises an AttributeError with a suggestion.
 
@@ -318,7 +318,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
 
 
 class OpenedTwin(TwinOf[T], BlockingContext):
-    """Twin of an object whose context is open on a loop thread. Closing it ends the thread, unless that is shared."""
+    """Twin of an object whose context is open on a loop thread. Closing it ends the thread, unless it is shared."""
 
     def __init__(self, loop: LoopThread, context: OpenContext[T], *, owns_loop: bool) -> None:
         super().__init__(loop, context.value)
@@ -340,7 +340,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     _opened_by = "connect"
 
     def _part(self, name: str, twin: Callable[[LoopThread, Any], T]) -> T:
-        """Return a part of the vehicle, created on the loop thread on first access."""
+        """Return the twin of a sub-object, such as ``parameters``, created on the loop thread on first access."""
         # No lock is used, because code on the loop's thread reads parts, too, and must not wait. If two threads create
         # a part at the same time, setdefault() keeps one of them.
         key = f"_part_{name}"
@@ -367,8 +367,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         is_hold_pending = self.aio.is_hold_pending
         self.close()
-        # `close` does not pass the exception to the asynchronous context, so the warning of that context is logged
-        # here.
+        # `close` does not pass the exception to the asynchronous context, which would log this warning.
         if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)
 

@@ -1,4 +1,4 @@
-"""Hand-written parts of the blocking component."""
+"""Base class of the generated blocking twin of `OnboardComponent`, and the function that opens the twin."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ FleetT = TypeVar("FleetT", bound="FleetTwin")
 
 
 class _Borrowed(Generic[T]):
-    """Replaces the OpenContext of a fleet's vehicle twins, because the fleet closes the vehicles, not the twins."""
+    """Stands in for an OpenContext whose vehicle belongs to a fleet. ``close`` does nothing: the fleet closes it."""
 
     def __init__(self, value: T) -> None:
         self.value = value
@@ -35,7 +35,7 @@ class _Borrowed(Generic[T]):
 
 
 class SelectionTwin(TwinOf[SelectionT]):
-    """Twin of a selection of vehicles. ``vehicles`` are twins, ``member.vehicle`` is the asynchronous object."""
+    """Twin of a selection of vehicles. ``vehicles`` has twins, but a member's ``vehicle`` is asynchronous."""
 
     @cached_property
     def vehicles(self) -> Mapping[str, Vehicle]:
@@ -75,8 +75,7 @@ class FleetTwin(OpenedTwin["AsyncFleet"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         without_hold = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
         self.close()
-        # `close` does not pass the exception to the asynchronous context, so the warning of that context is logged
-        # here.
+        # `close` does not pass the exception to the asynchronous context, which would log this warning.
         if exc is not None:
             for vehicle in without_hold:
                 warn_if_left_flying(vehicle)

@@ -188,9 +188,9 @@ class Page:
         self._page_of_other_twins = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
-        """Add the imports for an expression. Without ``at_run_time``, they are for type checkers only.
+        """Add imports for the names in an expression, for type checkers only unless ``at_run_time`` is true.
 
-        The names are those imported by one of ``modules``, or defined in the first of them.
+        A name that none of ``modules`` imports is defined in the first of them.
         """
         if node is None:
             return
@@ -219,7 +219,7 @@ class Page:
             self.for_types.add(origin)
 
     def import_literals_in(self, node: ast.AST | None, module: str) -> None:
-        """Import the Literals of an annotation at run time, because ``checked`` needs their values."""
+        """Import the Literals of an annotation at run time, because the decorator ``checked`` needs their values."""
         if node is None:
             return
         # Classes need no import at run time, because `checked` knows them by their names.

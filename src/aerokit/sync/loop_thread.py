@@ -34,7 +34,7 @@ CLOSED_DURING_CALL = "the connection was closed while this call waited"
 
 
 class LoopThread:
-    """An asyncio event loop on a daemon thread. It is closed at interpreter exit.
+    """An asyncio event loop on a daemon thread. The loop is closed at interpreter exit.
 
     The loop and its thread do not refer to this object, so that it can be garbage collected while they run; see
     :meth:`when_dropped`. Functions run with the loop's context variables rather than the caller's.
@@ -126,11 +126,11 @@ class LoopThread:
                 with contextlib.suppress(AerokitError):
                     self._start(call)
             if call is not None:
-                self._cancel(call)  # A shielded function shields what must not be cancelled.
+                self._cancel(call)  # The functions of `run_shielded` shield their own clean-up.
                 wait_s = SIGNAL_CHECK_INTERVAL_S if is_shielded else INTERRUPTED_CALL_TIMEOUT_S
                 while call.is_scheduled and not call.wait(wait_s):
-                    may_wait_on = is_shielded and self._thread.is_alive()  # The wait for clean-up has no limit.
-                    if not may_wait_on:
+                    must_wait_on = is_shielded and self._thread.is_alive()
+                    if not must_wait_on:
                         break
                 # An error of the clean-up function must not be lost, so it becomes the cause of the raised exception.
                 failure = call.pop_exception() if is_shielded else None
@@ -152,10 +152,7 @@ class LoopThread:
         return self.run(call)
 
     def enter(self, context: AbstractAsyncContextManager[T]) -> T:
-        """Enter a context manager on the loop.
-
-        The caller must exit it with :meth:`run_shielded`.
-        """
+        """Enter a context manager on the loop. The caller must exit it with :meth:`run_shielded`."""
         is_entered = False
 
         async def enter() -> T:

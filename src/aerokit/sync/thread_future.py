@@ -65,7 +65,7 @@ class ThreadFuture(Generic[T]):
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:
-        # The traceback of a stored error refers to this object, which is a reference cycle.
+        # Forget the error, because its traceback refers to this object, which would be a reference cycle.
         error, self._error = self._error, None
         return error
 

@@ -837,14 +837,17 @@ class External(TwinOf["AsyncExternal"]):
     """
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
-        """Supply pose and velocity (ODOMETRY). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
+        """Supply pose and velocity (ODOMETRY). Needs VISO_TYPE 1 to 3 on ArduPilot, EKF2_EV_CTRL above 0 on PX4."""
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.odometry, rate_hz=rate_hz, valid_for_s=valid_for_s),
         )
 
     def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
-        """Supply a pose (VISION_POSITION_ESTIMATE). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
+        """Supply a pose (VISION_POSITION_ESTIMATE).
+
+        Needs VISO_TYPE 1 to 3 on ArduPilot, EKF2_EV_CTRL above 0 on PX4.
+        """
         return MeasurementStream(
             self._loop,
             self._loop.call(self.aio.vision_position, rate_hz=rate_hz, valid_for_s=valid_for_s),
@@ -2445,8 +2448,8 @@ class Calibration(CalibrationTwin):
     and airspeed, PX4's ESCs) end in seconds.
 
     Iterating raises:
-        OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
-            texts); or the vehicle is armed, or not known to be disarmed.
+        OperationRejected: the calibration failed, or another ground station cancelled it (``reasons`` has the vehicle's
+            status texts); or the vehicle is armed, or not known to be disarmed.
         NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
         CommandRejected: the vehicle refused to start.
         CommandTimeout: the vehicle did not answer.
@@ -3487,9 +3490,8 @@ class Camera(TwinOf["AsyncCamera"]):
 class Settings(TwinOf["AsyncSettings"]):
     """The settings of one component. Coroutines exchange messages with the component; ``table`` is the local copy.
 
-    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations.
-    Each change of a value is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the
-    table.
+    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, whoever changed the setting. Each
+    change of a value is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the table.
 
     A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
@@ -3647,7 +3649,7 @@ class Component(TwinOf["AsyncComponent"]):
     """One component of a vehicle, for example a camera, a gimbal or a companion computer.
 
     Returned by :meth:`aerokit.Vehicle.component`. Commands, messages, rates, parameters and files of the component work
-    like those of the autopilot. https://mavlink.io/en/services/component_information.html
+    like those of the autopilot. See https://mavlink.io/en/services/component_information.html
     """
 
     @property
@@ -5316,9 +5318,9 @@ class Vehicle(VehicleTwin):
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
-        signed with the key, or with None, when they are no longer signed. Every other vehicle on this connection needs
-        the key too, or ``signing.allow_unsigned``. If you cancel the call, the vehicle may still have accepted the
-        change. See docs/signing.md.
+        signed with the key or, for None, no longer signed. Every other vehicle on this connection needs the key too, or
+        ``signing.allow_unsigned``. If you cancel the call, the vehicle may still have accepted the change. See
+        docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.

@@ -340,9 +340,9 @@ class Vehicle(
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
-        signed with the key, or with None, when they are no longer signed. Every other vehicle on this connection needs
-        the key too, or ``signing.allow_unsigned``. If you cancel the call, the vehicle may still have accepted the
-        change. See docs/signing.md.
+        signed with the key or, for None, no longer signed. Every other vehicle on this connection needs the key too, or
+        ``signing.allow_unsigned``. If you cancel the call, the vehicle may still have accepted the change. See
+        docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.

@@ -38,8 +38,8 @@ class Calibration(AsyncIterator["CalibrationStep"]):
     and airspeed, PX4's ESCs) end in seconds.
 
     Iterating raises:
-        OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
-            texts); or the vehicle is armed, or not known to be disarmed.
+        OperationRejected: the calibration failed, or another ground station cancelled it (``reasons`` has the vehicle's
+            status texts); or the vehicle is armed, or not known to be disarmed.
         NotSupported: the vehicle has no such sensor or calibration. Nothing was sent.
         CommandRejected: the vehicle refused to start.
         CommandTimeout: the vehicle did not answer.

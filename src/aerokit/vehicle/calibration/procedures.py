@@ -51,8 +51,8 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    # Time of the last check that found the state CALIBRATING. Infinite until then, so that `has_ended_silently` returns
-    # False.
+    # When the vehicle was last seen in the state CALIBRATING. Infinite before the first time, so that
+    # `has_ended_silently` returns False.
     calibrating_at = math.inf
     with ExitStack() as cleanup:
 
@@ -106,13 +106,13 @@ def _step_after(step: CalibrationStep, report: CalibrationReport) -> Calibration
         return step.replace(instruction=report.text, pose=next(iter(remaining), None), remaining=remaining)
     if report.kind in ("text", "already done"):
         return step.replace(instruction=report.text)
-    return step  # The other reports ("started", "side progress") do not change the step.
+    return step  # "started" and "side progress" do not change the step.
 
 
 async def ardupilot_single_command(
     run: CalibrationRun, *params: float, instruction: str
 ) -> AsyncGenerator[CalibrationStep, None]:
-    """Send the one command of a calibration. Its acknowledgement is the result."""
+    """Run a calibration that is one command, with the acknowledgement as the result."""
     run.check_ready()
     yield run.new_step(None, instruction)
     await run.begin(cancel=None)
@@ -290,7 +290,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         cleanup.enter_context(run.session.streaming("rc_channels"))
 
         async def wait_channels() -> None:
-            previous_update = channels.updated_at  # Older stick positions may be outdated.
+            previous_update = channels.updated_at  # Only later stick positions count.
             await run.wait(
                 lambda: channels.updated_at > previous_update,
                 CHANNELS_TIMEOUT_S,

@@ -64,7 +64,7 @@ class CalibrationRun:
         self._cannot_cancel_reason = ""  # why the calibration cannot be cancelled, for the user; empty if it can be
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
-        # Closed when the calibration ends: removes the callbacks, and the order that cancels the calibration.
+        # Closed when the calibration has ended on the vehicle. Removes callbacks, and stops sending the cancel command.
         self._cleanup = ExitStack()
         self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
@@ -82,13 +82,13 @@ class CalibrationRun:
             raise NotSupported(
                 f"{self.call_name}: aerokit does not know how to calibrate {autopilot.firmware}; nothing was sent"
             )
-        self.session.check_disarmed(self.call_name, is_current=self.context.arbiter.is_state_recent)
+        self.session.check_disarmed(self.call_name, is_state_recent=self.context.arbiter.is_state_recent)
 
     async def begin(self, cancel: tuple[float, ...] | None, cannot_cancel_reason: str = "") -> None:
         """Register this calibration as running, once the cancellation of earlier ones has ended.
 
-        ``cancel`` is the command that cancels this calibration, with its parameters. Raises BusyError if another
-        calibration is in progress.
+        ``cancel`` is the command that cancels this calibration, with its parameters; None if there is none. Raises
+        BusyError if another calibration is in progress.
         """
         self.check_ready()
         # A deleted `Calibration` abandons its run in the next iteration of the event loop, so wait for that.
@@ -152,8 +152,8 @@ class CalibrationRun:
             self.finish()
             return
         arbiter = self.context.arbiter
-        # When another party takes over, the arbiter ends this order, and `_confirm_cancel` then sends no more cancel
-        # commands.
+        # When the pilot or another ground station takes over, the arbiter ends this order, and `_confirm_cancel` stops
+        # sending the cancel command.
         order = self._cleanup.enter_context(arbiter.auxiliary_order(ends_with_actions=False))
         self._cancel_command_status = self._cleanup.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
@@ -178,7 +178,7 @@ class CalibrationRun:
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
-        # All callers check first that the vehicle is not silent. A repetition of the command has no further effect.
+        # The callers have checked that the vehicle is not silent. A repetition of the command has no further effect.
         self._cancel_sent_at = self.session.connection.now()
         self.session.commands.forget_result(int(command))
         self.session.commands.send_unconfirmed(int(command), *params)
@@ -196,7 +196,7 @@ class CalibrationRun:
                         self._is_unconfirmed = False
                         return
                     is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
-                    if is_taken_over:  # The command might disturb the other party.
+                    if is_taken_over:  # The command might disturb the pilot or the other ground station.
                         return
                     if not self.context.arbiter.is_state_recent:
                         continue

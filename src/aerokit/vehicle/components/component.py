@@ -53,7 +53,7 @@ class ComponentStatus(Snapshot):
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
     MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. ``device_id`` is 1 to 6 for a camera or gimbal without
     its own component id, otherwise 0. The ``component_id`` of such a device is that of the component to which it is
-    attached. ``received_at`` is the loop time of the component's last message.
+    attached. ``received_at`` is the time of the component's last message on the event loop's clock.
     """
 
     component_id: int
@@ -109,7 +109,7 @@ class Component(ReadOnly):
     """One component of a vehicle, for example a camera, a gimbal or a companion computer.
 
     Returned by :meth:`aerokit.Vehicle.component`. Commands, messages, rates, parameters and files of the component work
-    like those of the autopilot. https://mavlink.io/en/services/component_information.html
+    like those of the autopilot. See https://mavlink.io/en/services/component_information.html
     """
 
     def __init__(

@@ -40,9 +40,8 @@ MODE_SETTING = "CAM_MODE"
 class Settings:
     """The settings of one component. Coroutines exchange messages with the component; ``table`` is the local copy.
 
-    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations.
-    Each change of a value is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the
-    table.
+    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, whoever changed the setting. Each
+    change of a value is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the table.
 
     A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
@@ -201,7 +200,7 @@ class Settings:
                     listed = await transfers.run(exchange)
                     if self._reboots != reboots_before:
                         continue  # A part of the list is from before the reboot.
-                    # The order is the component's. The values in `_known` take precedence, because `_store` has also
+                    # `listed` has the component's order. The values in `_known` take precedence, because `_store` has
                     # recorded the messages during the download.
                     self._known = {**listed, **self._known}
                     self._is_complete = True

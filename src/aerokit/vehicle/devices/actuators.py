@@ -251,7 +251,7 @@ class Actuators(ReadOnly):
             motor_count = 1
             start = (number, PERCENT, throttle_percent, duration_s, motor_count)
             stop = (number, PERCENT, 0, 0, motor_count)
-        session.check_disarmed("test_motor", is_current=arbiter.is_state_recent)
+        session.check_disarmed("test_motor", is_state_recent=arbiter.is_state_recent)
         # On ArduPilot, a new test ends the test of another motor.
         order = arbiter.device_order("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
         spins_until = order.given_at + duration_s

@@ -397,7 +397,7 @@ def _triangle(linear_variance: float | None, angular_variance: float | None) -> 
     triangle = [0.0] * TRIANGLE_SIZE
     for indexes, variance in ((POSITION_DIAGONAL, linear_variance), (ORIENTATION_DIAGONAL, angular_variance)):
         for index in indexes:
-            # For a variance of 0, both autopilots use the minimum in their parameters. So 0 is sent for an unknown
+            # For a variance of 0, ArduPilot and PX4 use the minimum in their parameters. So 0 is sent for an unknown
             # angular variance, for which ArduPilot does not accept NaN.
             triangle[index] = variance or 0.0
     if linear_variance is None:

@@ -55,11 +55,14 @@ class External:
         self._timesync_answers = TimesyncAnswers(context.session)
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
-        """Supply pose and velocity (ODOMETRY). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
+        """Supply pose and velocity (ODOMETRY). Needs VISO_TYPE 1 to 3 on ArduPilot, EKF2_EV_CTRL above 0 on PX4."""
         return self._stream("odometry", OdometryMeasurement, self._encode.odometry, rate_hz, valid_for_s)
 
     def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
-        """Supply a pose (VISION_POSITION_ESTIMATE). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
+        """Supply a pose (VISION_POSITION_ESTIMATE).
+
+        Needs VISO_TYPE 1 to 3 on ArduPilot, EKF2_EV_CTRL above 0 on PX4.
+        """
         return self._stream("vision_position", PoseMeasurement, self._encode.vision_position, rate_hz, valid_for_s)
 
     def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:

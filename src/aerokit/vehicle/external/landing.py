@@ -56,11 +56,10 @@ class LandingReport(Snapshot):
     """Report of a precision landing, made when the vehicle is on the ground and disarmed.
 
     ``last_target`` is the last measurement. ``unseen_s`` is its age at the end, usually above 0, because a camera
-    rarely sees the target from close by. ``losses`` are the periods of more than a second after which the target was
-    visible again. ``climbed_m`` is how far the vehicle climbed during the landing, in a retry of ArduPilot or a search
-    of PX4.
-    ``used_target`` is False if no measurement was sent during the descent; the vehicle then landed where its firmware
-    chose. ``texts`` are the vehicle's status texts since the order.
+    rarely sees the target from close by. ``losses`` are the periods of more than a second without the target, except
+    the one before the end. ``climbed_m`` is how far the vehicle climbed during the landing, when it retried (ArduPilot)
+    or searched for the target (PX4). ``used_target`` is False if no measurement was sent during the descent; the
+    vehicle then landed where its firmware chose. ``texts`` are the vehicle's status texts since the order.
     """
 
     last_target: TargetMeasurement | None
@@ -125,7 +124,7 @@ class TargetLanding:
         self._source_error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
-        """Read the source until it ends. Its error is kept for `acquire` and `await_disarmed`."""
+        """Read the source until it ends. If it raises, `acquire` or `await_disarmed` raises the exception."""
         try:
             if isinstance(source, AsyncIterable):
                 async for target in source:
@@ -138,7 +137,7 @@ class TargetLanding:
         except Exception as error:
             self._source_error = error
         finally:
-            if isinstance(source, AsyncGenerator):  # It may still have a camera open.
+            if isinstance(source, AsyncGenerator):  # The generator may have a camera open.
                 await source.aclose()
 
     async def acquire(self, reader: asyncio.Task[None], timeout: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from typing import TYPE_CHECKING, Generic, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from aerokit._internal.arguments import check_kind, check_range, checks_arguments
 from aerokit.errors import NotSupported, OperationRejected, SetpointStreamStopped
@@ -70,6 +70,11 @@ class TimesyncAnswers:
 
 
 @checks_arguments
+class _EncodedMeasurement(NamedTuple):
+    messages: tuple[Message, ...]
+    measured_at: float
+
+
 class MeasurementStream(Generic[MeasurementT]):
     """Sends the measurements passed to ``send``: each at most once, and at most ``rate_hz`` measurements a second.
 
@@ -107,10 +112,10 @@ class MeasurementStream(Generic[MeasurementT]):
         self._probe = probe
         self._period_s = 1 / rate_hz
         self._valid_for_s = valid_for_s
-        # Values of the parameters that select the measurements, read when the block is entered.
+        # Parameters that decide whether the vehicle uses the measurements, read when the block is entered.
         self._parameters: dict[str, float] = {}
-        # The messages of the measurement to send at the end of the period, and the time of the measurement.
-        self._waiting: tuple[tuple[Message, ...], float] | None = None
+        # The measurement to send at the end of the period.
+        self._waiting: _EncodedMeasurement | None = None
         # Calls `_flush` at the end of the period, if a measurement waits.
         self._timer: asyncio.TimerHandle | None = None
         # End of the present period. The next measurement is sent at this time at the earliest.
@@ -187,7 +192,7 @@ class MeasurementStream(Generic[MeasurementT]):
         measured_at: float | None = getattr(measurement, "measured_at", None)
         if self._waiting is not None:  # The new measurement replaces the waiting one.
             self._dropped += 1
-        self._waiting = (messages, now if measured_at is None else measured_at)
+        self._waiting = _EncodedMeasurement(messages, now if measured_at is None else measured_at)
         if now >= self._next_at:
             self._flush()
         elif self._timer is None:

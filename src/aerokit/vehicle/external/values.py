@@ -35,7 +35,7 @@ LocalFrame: TypeAlias = Literal["ned", "frd", "enu", "flu"]
 """Axes of a local frame.
 
 ``ned``: north, east, down. ``frd``: forward, right, down of the vehicle at its start. ``enu``: east, north, up.
-``flu``: forward, left, up. The last two are the frames of ROS (REP 103). With them, the body axes are ``flu``.
+``flu``: forward, left, up. ROS uses the last two (REP 103). With either of them, the body axes are ``flu``, too.
 """
 RangeDirection: TypeAlias = Literal["down", "up", "forward", "back", "left", "right"]
 

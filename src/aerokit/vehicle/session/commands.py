@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from aerokit.protocols.command import OrderStatus
 
 UNSUPPORTED_RESULTS = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
-"""Results of a command that the firmware does not support: not at all, or not in this message or frame."""
-# A command is repeated after this many measured round trips at the earliest, because its ack may arrive until then.
+"""Results of a command that the firmware does not support at all, or not in this message or frame."""
+# Minimum wait for an ack before the command is repeated, in measured round-trip times.
 MIN_ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
-"""An ack is considered lost if it has not arrived this many seconds after the end of the call for its command."""
+"""Seconds after the end of a call until an ack that has not arrived by then is considered lost."""
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""
@@ -48,10 +48,11 @@ class CommandSender:
     """Runs the command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
     COMMAND_ACK has no request id. Commands with the same MAV_CMD to one component are therefore serialized; other
-    commands never wait for each other. A late ack of a cancelled or unconfirmed command is not taken for the ack of
-    the next command.
+    commands never wait for each other. A late ack of a command whose call has already ended is not taken for the
+    ack of the next command.
 
-    A command may belong to an order. If the order ends while its command runs or waits, the command is abandoned.
+    A command may belong to an order, such as a ``go_to`` call. When a newer order replaces this order, its command is
+    not repeated or, if it waits for an earlier command, not sent.
     """
 
     def __init__(
@@ -74,14 +75,13 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # For each command: one entry per ack of earlier calls that may still arrive. The entry is the time since which
-        # no call waits for that ack.
+        # Maps each command to the acks of earlier calls that may still arrive, each as the time when its call ended.
         self._pending_acks: dict[_Key, list[float]] = {}
-        # The last MAV_RESULT of each command, and the time at which it was last accepted.
+        # The last MAV_RESULT of each command, and the times at which it was last accepted and last refused.
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
-        # The time of the last refusal of a call. The time and the MAV_RESULT of the last refusal for which none waited.
         self._refused_at: dict[_Key, float] = {}
+        # Time and MAV_RESULT of the last refusal of each command that arrived when no ack was expected.
         self._late_refusals: dict[_Key, tuple[float, int]] = {}
         self._is_closed = False
         self._detach_callbacks = (
@@ -189,8 +189,7 @@ class CommandSender:
         return self.last_result(command, component_id) in UNSUPPORTED_RESULTS
 
     def may_get_late_ack(self, command: int, component_id: int) -> bool:
-        """Return True if an earlier transmission of this command may still be answered."""
-        # A command that is sent once would take such an ack for its own.
+        """Return True if an ack of an earlier call may still arrive. A call with one attempt takes it for its own."""
         earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return any(since >= earliest for since in self._pending_acks.get((component_id, command), ()))
 
@@ -199,10 +198,10 @@ class CommandSender:
         return self._accepted_at.get((self._component_id, command), -math.inf)
 
     def late_refusal(self, command: int, component_id: int, since: float) -> int | None:
-        """Return the MAV_RESULT of a refusal after ``since`` for which no call waited; None if there was none.
+        """Return the MAV_RESULT of a refusal that arrived after ``since``, when no ack was expected; None if none did.
 
-        The ack that a call took for its own was then the late or repeated ack of an earlier command. After several
-        calls, the refusal belongs to the newest one, so it is None for the others.
+        Such a refusal shows that the last call took a late or repeated ack of an earlier call for its own. If an
+        ACCEPTED arrived after ``since``, the refusal belongs to that newer call, and the result is None.
         """
         key = (component_id, command)
         if self._accepted_at.get(key, -math.inf) > since:
@@ -225,8 +224,8 @@ class CommandSender:
         key = (message.target_component or self._component_id, message.command)
         order_status, was_just_sent = options.order_status, options.was_just_sent
         self._abort_run_of_ended_order(key)
-        # A caller may send a command for an order that has already ended. If the order ends later, while this call
-        # waits for the lock, the command is not sent.
+        # A command is sent even if its order ended before this call, but not if the order ends during the wait for the
+        # lock.
         earlier_end = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:
@@ -277,7 +276,7 @@ class CommandSender:
         if order_status is not None and order_status.end:
             _, command = key
             text = f"no COMMAND_ACK for {command_name(command)} yet; not sent again: {order_status.end}"
-            # A newer order need not wait for the rest of this run.
+            # The command of a newer order need not wait until this run ends.
             self._runs[key].abort(CommandTimeout(text))
 
     def _min_attempt_timeout_s(self) -> float:
@@ -285,9 +284,9 @@ class CommandSender:
         return min(MIN_ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 
     def attempts_in_time(self, attempts: int, attempt_timeout: float) -> int:
-        """Return how many attempts fit into the time of ``attempts`` on a fast link; at least `MAX_ATTEMPTS`.
+        """Return how many attempts take as long on this link as ``attempts`` on a fast one; at least `MAX_ATTEMPTS`.
 
-        On a slow link, each attempt takes longer than ``attempt_timeout``.
+        On a slow link, each attempt takes longer than ``attempt_timeout`` seconds.
         """
         slow_timeout_s = max(attempt_timeout, self._min_attempt_timeout_s())
         return max(MAX_ATTEMPTS, int(attempts * attempt_timeout / slow_timeout_s))
@@ -297,7 +296,6 @@ class CommandSender:
         return self._acks_per_command.get(command, 1)
 
     def _add_pending_acks(self, key: _Key, pending_since: Sequence[float]) -> None:
-        """Record acks that may still arrive, each by a time, so that the next command ignores them."""
         if pending_since:
             self._pending_acks.setdefault(key, []).extend(pending_since)
 
@@ -334,7 +332,7 @@ class CommandSender:
                 del self._pending_acks[key]
         elif is_final and ack.result != MavResult.ACCEPTED and key in self._results and self._is_for_our_ids(ack):
             now = self._connection.now()
-            # After another refusal, this may be a copy of it.
+            # Soon after another refusal, this ack may be a copy of it.
             if now - self._refused_at.get(key, -math.inf) > PENDING_ACK_TIMEOUT_S:
                 self._results[key] = ack.result
                 self._late_refusals[key] = now, ack.result

@@ -118,7 +118,7 @@ def _is_slow(achieved_hz: float, requested_hz: float) -> bool:
 
 
 class MessageRates:
-    """Makes one component send the requested messages, each at the highest requested rate.
+    """Requests the messages of one component, each at the highest rate that a caller of `request` needs.
 
     Uses MAV_CMD_SET_MESSAGE_INTERVAL, or REQUEST_DATA_STREAM if the vehicle does not support that command
     (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not arrive, for example after a
@@ -197,7 +197,7 @@ class MessageRates:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
                 self._watch(stream)
-            # A stream whose last request was not answered may be due again. All other changes set the event themselves.
+            # A request that was not answered becomes due again later, and nothing else sets the event then.
             if any(stream.failures for stream in self._streams.values()):
                 self._has_due_streams.set()
 
@@ -239,7 +239,8 @@ class MessageRates:
                 stream.message_type.ID,
                 interval_us,
                 component_id=self._component_id,
-                # A command that is sent once could take the late refusal of another message for its own.
+                # COMMAND_ACK does not name the message. With only one attempt, `send_long` could take the late ack of a
+                # request for another message for its own.
                 attempts=2,
             )
         except CommandRejected as error:
@@ -248,7 +249,7 @@ class MessageRates:
                 return
             refusal = error
         except CommandTimeout:
-            # A failure from before a call of `request_again` does not count.
+            # If `request_again` was called meanwhile, the stream is due at once and not postponed.
             if reset_count == self._reset_count:
                 stream.postpone(self._connection.now())
             return
@@ -268,7 +269,7 @@ class MessageRates:
             stream.requested_hz = None
 
     def _mark_refused(self, stream: _Stream, hz: float, reason: str) -> None:
-        # Lower rates are requested next, if they are needed.
+        # `needed_hz` ignores refused rates, so a lower rate is requested next if a caller needs one.
         stream.refused_hz.add(hz)
         if stream.requested_hz is None or not hz:
             stream.mark_requested(self._connection.now(), AUTOPILOT_DEFAULT)
@@ -335,7 +336,7 @@ class MessageRates:
         if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
-        if achieved_hz == 0 and stream.is_optional:  # An optional stream need not exist.
+        if achieved_hz == 0 and stream.is_optional:  # The vehicle may lack an optional message.
             return
         # If no message arrived in the first period of the window, the stream began later. Its average is then too low.
         has_just_started = achieved_hz > 0 and stream.counts_at_checks[0] == stream.counts_at_checks[1]

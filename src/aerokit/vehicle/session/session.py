@@ -60,12 +60,11 @@ if TYPE_CHECKING:
 # Seconds between requests for constants that are not known yet.
 RETRY_INTERVAL_S = 3.0
 
-# The modes are requested until one is received, or until this many requests were answered. One answer is not enough:
-# it may belong to an earlier request, because PX4 acknowledges a command over each of its ports.
+# The modes are not requested any more after this many acknowledgements without a mode. A single one does not suffice,
+# because it may be a copy: PX4 acknowledges a command over each of its ports.
 MAX_MODE_REQUESTS = 3
 
-# At first, the version is requested up to EAGER_REQUESTS times in quick succession, with EAGER_INTERVAL_S seconds for
-# each acknowledgement, and as long again for the message.
+# The first requests for the version: maximum number, and seconds to wait for each acknowledgement and each message.
 EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
@@ -118,7 +117,7 @@ STATUS_TEXT_DELAY_S = 0.3
 ACTION_HZ = 5.0
 """Rate in Hz of the messages that an action waits for.
 
-The position has 10 Hz. Because 5 divides 10, these messages share datagrams with the position.
+This is half the rate of the position, so that the vehicle can send these messages in the same datagrams.
 """
 
 RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
@@ -235,7 +234,7 @@ class VehicleSession:
         return self.connection.is_open and not self.is_closed
 
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
-        """Make time-out errors of these state cells mention rejected signatures."""
+        """Make time-out errors of these state cells mention frames that were dropped for their signature."""
         for cell in cells:
             cell._explain_timeout = self._describe_signatures
 
@@ -261,12 +260,9 @@ class VehicleSession:
             for release in release_requests:
                 release()
 
-    def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
-        """Raise OperationRejected unless the vehicle is known to be disarmed.
-
-        Pass ``is_current=False`` if the last HEARTBEAT is too old to show this; the call then always raises.
-        """
-        if not self.telemetry.is_confirmed_disarmed or not is_current:
+    def check_disarmed(self, action: str, *, is_state_recent: bool = True) -> None:
+        """Raise OperationRejected unless the vehicle is known to be disarmed and ``is_state_recent`` is true."""
+        if not self.telemetry.is_confirmed_disarmed or not is_state_recent:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
@@ -400,7 +396,7 @@ class VehicleSession:
         ]
 
     def _attach_watched_streams(self) -> None:
-        """Make states with a ``watched_hz`` request their message while the program watches them."""
+        """Make each state with a ``watched_hz`` request its message while the program waits for it or follows it."""
         for name, state in STATES.items():
             cell = self.telemetry.cells[name]
             for source in state.sources:
@@ -412,12 +408,12 @@ class VehicleSession:
                     cell._feed_from(*cell._feeds, WatchedStream(cell, request))  # in addition to its present feeds
 
     def _on_link_selected(self, event: LinkSelected) -> None:
-        # An autopilot keeps separate rates for each of its ports.
+        # An autopilot keeps separate rates for each of its ports, and may receive the new link on another port.
         if event.system_id == self.system_id and event.before is not None:
             self.rates.request_again()
 
     def _on_computer_slept(self, event: ComputerSlept) -> None:
-        # The loop's clock stood still while the computer slept.
+        # The loop's clock stood still while the computer slept, so the ages do not include this time yet.
         self.watch.last_heartbeat_at -= event.seconds
         for cell in (*self.telemetry.cells.values(), *self._cells):
             cell._add_age(event.seconds)

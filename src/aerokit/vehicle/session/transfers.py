@@ -1,4 +1,4 @@
-"""``Transfers``: timing, capabilities and lifetime shared by parameters, missions, files and logs of one vehicle."""
+"""``Transfers``: runs the exchanges of messages that transfer parameters, missions, files and logs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Messaging(Protocol):
 
     @property
     def transfers(self) -> Transfers:
-        """The object that runs the exchanges of this session."""
+        """Runner of the exchanges with this component."""
         ...
 
     def at_close(self, *functions: Detach) -> None:

@@ -37,11 +37,11 @@ REBOOT_MIN_DECREASE_MS = 3000
 # A decreased time shows a reboot only if it persists for this long and in at least two messages, because a single
 # message may be late.
 REBOOT_CONFIRM_S = 0.2
-# After a reboot was ordered, a clock that lags behind by more than this shows that the vehicle has rebooted. A boot
-# takes longer than this, and messages are delayed by less.
+# After a reboot was ordered, the vehicle counts as rebooted when its time since boot is more than this behind the
+# expected time. A boot takes longer than this, and messages are delayed by less.
 EXPECTED_REBOOT_MIN_LAG_MS = 2000
-# A simulation's clock may be faster than real time. Its speed is computed once this many seconds lie between the first
-# and the last report.
+# A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
+# many seconds apart.
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
@@ -199,7 +199,7 @@ class VehicleWatch:
 
     def _on_timesync(self, message: Timesync) -> None:
         frame = message.received_frame
-        # The vehicle answers TIMESYNC requests even if no streams are requested.
+        # The answers to TIMESYNC requests show a reboot even if the program requests no messages.
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._record_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
 
@@ -258,7 +258,7 @@ class _Counts(NamedTuple):
 class LinkWatch:
     """Measures the link to one vehicle once a second: loss by sequence numbers, delay by TIMESYNC, rates by counting.
 
-    See https://mavlink.io/en/services/timesync.html; ArduPilot and PX4 both support it.
+    ArduPilot and PX4 support TIMESYNC (https://mavlink.io/en/services/timesync.html).
     """
 
     def __init__(

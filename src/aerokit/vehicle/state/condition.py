@@ -82,8 +82,8 @@ class SensorHealth(Snapshot):
 class EstimatorHealth(Snapshot):
     """State estimator health from EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
 
-    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that flight by
-    position needs but that are not good yet. Ratios are innovations divided by their limits: below 1 is good.
+    ``message`` is the name of the message and ``flags`` its flags. ``missing`` names the estimates that are not
+    good yet, but needed to fly to a position. Ratios are innovations divided by their limits: below 1 is good.
     Accuracies are one standard deviation, in metres.
     """
 
@@ -162,7 +162,7 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
     """Return the flight mode in CURRENT_MODE, which reports a change earlier than HEARTBEAT but lacks ``base_mode``."""
-    # HEARTBEAT is needed too: it has base_mode, and it shows whether a custom_mode of 0 is a mode or means "no mode".
+    # Leave a custom_mode of 0 to HEARTBEAT, because it may mean "no mode". Before HEARTBEAT, base_mode is unknown.
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)

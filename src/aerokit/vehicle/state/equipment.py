@@ -245,7 +245,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
-    """Return all batteries, battery 0 with the values of SYS_STATUS; None if its voltage and charge are unknown."""
+    """Return all batteries, battery 0 with the values of SYS_STATUS; None if it has neither voltage nor charge."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = known(message.battery_remaining, unknown=-1)
     if voltage is None and remaining is None:

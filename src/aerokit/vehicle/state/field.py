@@ -41,8 +41,8 @@ class MessageSource(Generic[T]):
             of a function if `Telemetry` itself handles the message.
         needs_context: True if ``decode`` also takes a :class:`Context`.
         hz: the default rate to request, in Hz.
-        fallback: ignore the message if a better one has reported the state recently.
-        alternative: some autopilots send this message instead of the first message of the state.
+        fallback: True if the message is ignored when a better one has reported the state recently.
+        alternative: True if some autopilots send this message instead of the first message of the state.
         instance_field: the field with the number of the instance, such as the battery. The state combines all
             instances.
         watched_hz: the rate to request instead of ``hz`` while your program waits for the state or follows it.
@@ -77,11 +77,11 @@ class _HasCells(Protocol):
 
 
 class StateField(Generic[T]):
-    """Descriptor of a state: the class attribute is the declaration, the instance attribute is the state's cell.
+    """Descriptor of a state: the class attribute is the declaration, the instance attribute the cell with the value.
 
     Args:
         sources: the messages that report the state, the best first.
-        waits_for: shown in error texts while the state is unknown; default: the requested messages.
+        waits_for: what error texts name as missing while the state is unknown; default: the requested messages.
         eager: decode each message when it arrives, not on the first access to the value.
     """
 
@@ -156,8 +156,8 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# Even if the program reads no value, a frame is decoded at this interval. Otherwise, a frame without a fix could
-# replace the last frame with a position before that one is decoded.
+# A frame is decoded at least this often, even if the program reads no value. Otherwise, the last position before a loss
+# of the fix could be replaced, undecoded, by a frame without a position.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.
@@ -167,10 +167,9 @@ _HEADER_LENGTH = 9
 class StreamedMessage:
     """One message type of a vehicle's autopilot. Keeps the latest frame, and decodes it when a value is read.
 
-    ``instance_at`` is the offset of the instance number in the payload, None if the message has none. The latest frame
-    of each instance is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None if the frame is not
-    decoded yet. While one of the cells has observers, each frame is decoded when it arrives. Any thread may read a
-    cell, so ``lock`` protects this object.
+    Some messages report several instances, such as batteries, and have an instance number at ``instance_at`` in the
+    payload. The latest frame of each instance is kept. ``apply(frame, message)`` updates ``cells``; ``message`` is None
+    if the frame is not decoded yet. Any thread may read a cell, so ``lock`` protects this object.
     """
 
     __slots__ = (
@@ -206,7 +205,7 @@ class StreamedMessage:
         """The latest frame or decoded message of each instance number, until it is applied to the cells."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
-        """Keep a frame until a cell is read. Apply it now if a cell has observers, and once per MAX_DECODE_DELAY_S.
+        """Keep a frame until a cell is read. Apply it now if a cell has observers, or after MAX_DECODE_DELAY_S.
 
         ``message`` is the decoded frame, if it was decoded already.
         """

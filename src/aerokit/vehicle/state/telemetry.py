@@ -231,7 +231,7 @@ class Telemetry(States):
         """Return the function that updates the cell of a state from one type of message."""
         cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
-        # A lazy message is decoded late. It must not replace a newer value from a message of another type.
+        # A message in LAZY is decoded late, and must not replace a newer value from a message of another type.
         may_be_older = message_source.message in LAZY and len(field.sources) > 1
 
         def update(message: Any, source: Source) -> None:
@@ -273,7 +273,7 @@ class Telemetry(States):
         return StreamedMessage(self.component_id, cells, instance_at, apply, self._lock)
 
     def _has_recent_better_value(self, cell: StateCell[Any], source: Source) -> bool:
-        """Return True if another message than the fallback ``source`` recently reported the value."""
+        """Return True if a better message than the fallback ``source`` has reported the value recently."""
         return _is_from_other_message(cell, source) and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
 
     # --------------------------------------------------------- messages with special handling
