@@ -25,7 +25,7 @@ FleetT = TypeVar("FleetT", bound="FleetTwin")
 
 
 class _Borrowed(Generic[T]):
-    """Stands in for an OpenContext whose vehicle belongs to a fleet. ``close`` does nothing: the fleet closes it."""
+    """Stands in for the OpenContext of a vehicle that belongs to a fleet. ``close`` does nothing."""
 
     def __init__(self, value: T) -> None:
         self.value = value

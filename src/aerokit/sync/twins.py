@@ -2512,7 +2512,7 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         return Calibration(self._loop, self._loop.call(self.aio.barometer))
 
     def airspeed(self) -> Calibration:
-        """Calibrate the airspeed sensors. Shelter them from wind; PX4 later asks a person to blow into the tube."""
+        """Calibrate the airspeed sensors. Shelter them from wind. PX4 later asks a person to blow into the tube."""
         return Calibration(self._loop, self._loop.call(self.aio.airspeed))
 
     def radio(self) -> Calibration:

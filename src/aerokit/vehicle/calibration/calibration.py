@@ -154,7 +154,7 @@ class CalibrationControl:
         return self._prepare("barometer", _single_command("shelter the vehicle from wind"), command_param=3)
 
     def airspeed(self) -> Calibration:
-        """Calibrate the airspeed sensors. Shelter them from wind; PX4 later asks a person to blow into the tube."""
+        """Calibrate the airspeed sensors. Shelter them from wind. PX4 later asks a person to blow into the tube."""
         return self._prepare("airspeed", procedures.ardupilot_airspeed, command_param=6, param_value=2)
 
     def radio(self) -> Calibration:

@@ -27,7 +27,7 @@ UNSUPPORTED_RESULTS = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavRe
 MIN_ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
-"""Seconds after the end of a call until an ack that has not arrived by then is considered lost."""
+"""An ack is considered lost this many seconds after the end of the call that expected it."""
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""

@@ -185,7 +185,7 @@ class MessageRates:
         self._has_due_streams.set()
 
     async def run(self) -> None:
-        """Send the requests that are due, until cancelled. `watch` must run as well."""
+        """Send the requests that are due, until cancelled. Needs `watch`, which decides what is sent again."""
         while True:
             await self._has_due_streams.wait()
             self._has_due_streams.clear()

@@ -28,7 +28,7 @@ SUBSCRIPTION_HZ = 4.0
 
 
 def subscription_rate_hz(message_type: type[Message]) -> float | None:
-    """Return the default rate of a subscription, or None if the message is not streamed."""
+    """Return the default rate of a subscription; None for a message that vehicles do not send regularly."""
     name = message_type.__name__
     return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED_MESSAGES else None)
 

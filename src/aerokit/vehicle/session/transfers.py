@@ -38,9 +38,7 @@ class Messaging(Protocol):
     on_reboot: list[Callable[[], None]]
 
     @property
-    def transfers(self) -> Transfers:
-        """Runner of the exchanges with this component."""
-        ...
+    def transfers(self) -> Transfers: ...
 
     def at_close(self, *functions: Detach) -> None:
         """Register callbacks for the end of the vehicle's `async with` block."""
