@@ -126,7 +126,7 @@ U8, U16, I16 = 0xFF, 0xFFFF, 0x7FFF
 
 
 class Context:
-    """What a decoder may need besides the message. ``before`` is the previous value of the state."""
+    """Input of a decoder besides the message. ``before`` is the previous value of the state."""
 
     __slots__ = ("autopilot", "base_mode", "before", "home_is_known", "mode_names")
 
