@@ -276,6 +276,8 @@ def expand_kinds(kinds: Sequence[str], count: int | None) -> Sequence[str]:
     kinds = kinds or ("copter",)
     if count is None:
         return kinds
-    if len(kinds) != 1 or count < 1:
-        raise InvalidArgument(f"count = {count!r} is not allowed: count must be 1 or more, and needs a single kind")
+    if len(kinds) != 1:
+        raise InvalidArgument(f"count = {count!r} is not allowed with {len(kinds)} kinds of vehicles, only with one")
+    if count < 1:
+        raise InvalidArgument(f"count = {count!r} is not allowed: it must be at least 1")
     return list(kinds) * count

@@ -58,8 +58,8 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    In each of them, the vehicle sank 2 m or more, at 3 m/s or more. It stopped sinking within 0.6 s (or 1.5 intervals
-    of the logged velocities), and one of these is true:
+    In each of them, the vehicle sank 2 m or more, at 3 m/s or more, and came to a stop within 0.6 s; if the log has few
+    velocities, within 1.5 times the interval between two of them. In addition, one of these is true:
 
     - It was disarmed within 30 s after the stop, and its logged height changed by at most 1.5 m until then.
     - It was at most 3 m above home, and its logged height changed by at most 1.5 m in the next 30 s.
