@@ -16,10 +16,14 @@ if TYPE_CHECKING:
 _SHELLS = ("bash", "zsh", "fish")
 _COMMON_ADDRESSES = ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14540", "tcp:127.0.0.1:5760")
 _DEVICE_PATTERNS = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/cu.usb*")
-_PARAMETER_TABLES = {
-    "ArduPilot": tuple(f"sim/ardupilot/{kind}.param.csv" for kind in ("copter", "plane", "rover", "sub")),
-    "PX4": ("sim/px4/quadrotor.param.csv", "sim/px4/airplane.param.csv"),
-}
+_PARAMETER_TABLES = (
+    "ardupilot/copter",
+    "ardupilot/plane",
+    "ardupilot/rover",
+    "ardupilot/sub",
+    "px4/quadrotor",
+    "px4/airplane",
+)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -60,17 +64,10 @@ def kinds() -> tuple[str, ...]:
     return kind_names()
 
 
-def parameter_names(autopilot: str | None = None) -> list[str]:
-    """Return the sorted parameter names of the simulated vehicles.
-
-    ``autopilot`` is "ArduPilot" or "PX4"; None means both.
-    """
-    paths: list[str] = []
-    for name, paths_of_autopilot in _PARAMETER_TABLES.items():
-        if autopilot is None or autopilot == name:
-            paths += paths_of_autopilot
+def parameter_names() -> list[str]:
+    """Return the sorted parameter names of the simulated vehicles."""
     names = set()
-    for path in paths:
-        lines = files("aerokit").joinpath(path).read_text(encoding="utf-8").splitlines()
+    for table in _PARAMETER_TABLES:
+        lines = files("aerokit").joinpath(f"sim/{table}.param.csv").read_text(encoding="utf-8").splitlines()
         names |= {line.partition(",")[0] for line in lines if line and not line.startswith("#")}
     return sorted(names)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.arguments import add_baud, add_faults, add_vehicle_kind, address, number, system_id, writable_file
-from aerokit.apps.cli.completion import addresses, set_completions
-from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, connect_to, signing_of
+from aerokit.apps.cli.arguments import add_faults, add_vehicle_kind, number, system_id, writable_file
+from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, connect_to, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
 from aerokit.apps.cli.sim import injecting_faults, simulated_vehicle
@@ -30,13 +29,7 @@ _DEFAULT_LOG = "demo.tlog"
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_demo)
-    address_option = command.add_argument(
-        "--connect",
-        type=address,
-        metavar="ADDRESS",
-        help="vehicle to fly: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … (default: a simulated one)",
-    )
-    set_completions(address_option, addresses)
+    add_address(command, "--connect", what="vehicle to fly: ", default_text="a simulated one")
     add_vehicle_kind(command, "copter or plane with ArduPilot, px4 or px4_plane (default: copter)")
     add_faults(command)
     command.add_argument(
@@ -62,7 +55,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
     )
-    add_baud(command)
     add_signing_key(command, f"signing key of the --connect vehicle (${SIGNING_KEY_VARIABLE})")
     add_json(command)
 

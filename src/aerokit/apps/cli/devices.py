@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _MAX_PICTURES = 32_767
 _MAX_FILE_NAME = 200
 _ATTITUDE_TIMEOUT_S = 2.0
+_ID_HELP = "component id, or 1 to 6 for one attached to the autopilot (default: the first)"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -66,12 +67,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     format_storage = add_action(actions, "format", _format, "Format the storage. All pictures are deleted.")
     format_storage.add_argument("--yes", action="store_true", help="do not ask")
     for action in (info, photo, video, mode, zoom, streams, format_storage):
-        action.add_argument(
-            "--camera",
-            type=int,
-            metavar="ID",
-            help="component id, or 1 to 6 for one attached to the autopilot (default: the first)",
-        )
+        action.add_argument("--camera", type=int, metavar="ID", help=_ID_HELP)
 
 
 @asynccontextmanager
@@ -220,12 +216,7 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
     )
     release = add_action(actions, "release", run_release, "Return control of the gimbal to the pilot.")
     for action in (info, point, look, neutral, release):
-        action.add_argument(
-            "--gimbal",
-            type=int,
-            metavar="ID",
-            help="component id, or 1 to 6 for one attached to the autopilot (default: the first)",
-        )
+        action.add_argument("--gimbal", type=int, metavar="ID", help=_ID_HELP)
 
 
 @asynccontextmanager

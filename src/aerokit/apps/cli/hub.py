@@ -128,13 +128,11 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
     from aerokit.hub import Endpoint
 
     names = [name for name, _ in options.endpoints]
-    for option in ("read_only", "patient", "signed"):
-        for name in getattr(options, option):
-            _check_known(name, names)
-    for option in ("only", "block", "rate"):
-        for name, _ in getattr(options, option):
-            if name:  # "" stands for all endpoints
-                _check_known(name, names)
+    in_filters = [name for name, _ in (*options.only, *options.block, *options.rate) if name]  # "" means all endpoints
+    for name in (*options.read_only, *options.patient, *options.signed, *in_filters):
+        if name not in names:
+            hint = suggestion(name, names)
+            raise InvalidArgument(f"no endpoint is named {name!r}{hint}; endpoints: {', '.join(names)}")
     if options.signed and signing_of(options) is None:
         raise InvalidArgument(f"--signed needs a key: give --signing-key FILE, or set ${SIGNING_KEY_VARIABLE}")
     return [
@@ -154,25 +152,11 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
 
 
 def _patterns_for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
-    patterns: list[str] = []
-    for endpoint, filter_patterns in filters:
-        # "" stands for all endpoints.
-        if endpoint in ("", name):
-            patterns += filter_patterns
-    return tuple(patterns)
+    return tuple(pattern for endpoint, patterns in filters if endpoint in ("", name) for pattern in patterns)
 
 
 def _rates_for(name: str, filters: Sequence[tuple[str, dict[str, float]]]) -> dict[str, float]:
-    rates: dict[str, float] = {}
-    for endpoint, filter_rates in filters:
-        if endpoint in ("", name):
-            rates.update(filter_rates)
-    return rates
-
-
-def _check_known(name: str, names: list[str]) -> None:
-    if name not in names:
-        raise InvalidArgument(f"no endpoint is named {name!r}{suggestion(name, names)}; endpoints: {', '.join(names)}")
+    return {message: hz for endpoint, rates in filters if endpoint in ("", name) for message, hz in rates.items()}
 
 
 def _emit_hub_event(options: argparse.Namespace, event: HubEvent) -> None:
