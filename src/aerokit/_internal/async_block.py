@@ -20,9 +20,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def async_block(
-    function: Callable[P, AsyncIterator[T]],
-) -> Callable[P, AbstractAsyncContextManager[T]]:
+def async_block(function: Callable[P, AsyncIterator[T]]) -> Callable[P, AbstractAsyncContextManager[T]]:
     """Like contextlib.asynccontextmanager, but any use without ``async with`` raises a helpful TypeError."""
     make = asynccontextmanager(function)
 

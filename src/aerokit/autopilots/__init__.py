@@ -17,15 +17,7 @@ from aerokit.autopilots.ardupilot import (
     Blimp,
     ardupilot_for,
 )
-from aerokit.autopilots.base import (
-    Autopilot,
-    GimbalRules,
-    ModeOrder,
-    Purpose,
-    Reposition,
-    SetpointRules,
-    TakeOff,
-)
+from aerokit.autopilots.base import Autopilot, GimbalRules, ModeOrder, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.modes import Mode, ModeTable, is_armed
 from aerokit.autopilots.px4 import Px4, px4_custom_mode
 from aerokit.autopilots.telemetry import AutopilotVersion

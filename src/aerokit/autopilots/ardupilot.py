@@ -208,9 +208,7 @@ class ArduPilot(Autopilot):
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
         return (
             *self._missing_estimates(
-                flags,
-                required=ATTITUDE_AND_HEIGHT,
-                horizontal=POS_HORIZ_ABS | EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
+                flags, required=ATTITUDE_AND_HEIGHT, horizontal=POS_HORIZ_ABS | EkfStatusFlags.PRED_POS_HORIZ_ABS.value
             ),
             *bit_names(flags, EKF_PROBLEMS),
         )

@@ -8,12 +8,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 _OFF = "continues: the failsafe is off"
-_RETURN, _SMART, _HOLD, _TERMINATE = (
-    "returns to launch",
-    "returns on its own track",
-    "holds",
-    "stops its motors",
-)
+_RETURN, _SMART, _HOLD, _TERMINATE = "returns to launch", "returns on its own track", "holds", "stops its motors"
 GCS_FAILSAFE_ACTIONS: Mapping[str, Mapping[str, Mapping[float, str]]] = {
     "ArduCopter": {
         "FS_GCS_ENABLE": {

@@ -245,10 +245,7 @@ class Px4(Autopilot):
     def failing_sensors(self, present: int, enabled: int, health: int) -> tuple[str, ...]:
         # A sensor that is required but missing is reported as enabled but not present.
         missing = bit_names(enabled & ~present & ~health & ~PREARM_CHECK, SENSORS)
-        return (
-            *super().failing_sensors(present, enabled, health),
-            *(f"{name} (missing)" for name in missing),
-        )
+        return (*super().failing_sensors(present, enabled, health), *(f"{name} (missing)" for name in missing))
 
     def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool:
         # If the vehicle can be armed in its current mode, PX4 sets this bit, but only in ``health``.

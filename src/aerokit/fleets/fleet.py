@@ -140,10 +140,7 @@ class Fleet(Selection):
     # -------------------------------------------------------------------------------------- streams
 
     def events(
-        self,
-        *types: type[Event],
-        capacity: int = 1000,
-        overflow: Overflow = "drop_oldest",
+        self, *types: type[Event], capacity: int = 1000, overflow: Overflow = "drop_oldest"
     ) -> Subscription[FleetEvent]:
         """Subscribe to events of the fleet and its vehicles; use it in a ``with`` block.
 
@@ -174,11 +171,7 @@ class Fleet(Selection):
         return Subscription(attach, capacity=capacity, overflow=overflow)
 
     def states(
-        self,
-        *names: str,
-        every_arrival: bool = False,
-        capacity: int = 10_000,
-        overflow: Overflow = "drop_oldest",
+        self, *names: str, every_arrival: bool = False, capacity: int = 10_000, overflow: Overflow = "drop_oldest"
     ) -> Subscription[StateUpdate]:
         """Subscribe to states of all members; use it in a ``with`` block.
 

@@ -14,13 +14,7 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.connection.tasks import BackgroundTasks
-from aerokit.errors import (
-    BusyError,
-    InvalidArgument,
-    OperationRejected,
-    SetpointStreamStopped,
-    ValueUnknownError,
-)
+from aerokit.errors import BusyError, InvalidArgument, OperationRejected, SetpointStreamStopped, ValueUnknownError
 from aerokit.fleets.action import ActionKind, FleetAction
 from aerokit.fleets.distances import POSITION_MAX_AGE_S, altitude_amsl, position_of
 from aerokit.fleets.events import FollowingStopped
@@ -354,12 +348,7 @@ class Formations(Travel):
     """Actions of a fleet that fly formations."""
 
     async def form(
-        self,
-        formation: Formation,
-        *,
-        leader: str,
-        speed_m_s: float | None = None,
-        timeout: float | None = None,
+        self, formation: Formation, *, leader: str, speed_m_s: float | None = None, timeout: float | None = None
     ) -> FleetResult:
         """Fly each follower to its place around the leader, which stays where it is; see :meth:`go_to`.
 

@@ -86,11 +86,7 @@ class Path(Snapshot):
         legs, too.
         """
         first, last = self.points[0], self.points[-1]
-        points = [
-            first.replace(t_s=min(begin_s, first.t_s)),
-            *self.points,
-            last.replace(t_s=max(end_s, last.t_s)),
-        ]
+        points = [first.replace(t_s=min(begin_s, first.t_s)), *self.points, last.replace(t_s=max(end_s, last.t_s))]
         return [Leg(start, end) for start, end in pairwise(points)]
 
     def _check(self) -> None:

@@ -9,15 +9,7 @@ from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FleetError, InvalidArgument
 
-__all__ = [
-    "FleetResult",
-    "MemberFailure",
-    "Policy",
-    "PolicyDecision",
-    "PolicyName",
-    "PolicyOrder",
-    "PolicyRules",
-]
+__all__ = ["FleetResult", "MemberFailure", "Policy", "PolicyDecision", "PolicyName", "PolicyOrder", "PolicyRules"]
 
 PolicyName = Literal["hold_others", "land_others", "return_others", "continue_others"]
 """The built-in policies."""

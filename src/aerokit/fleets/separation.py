@@ -181,13 +181,7 @@ def separate_by_time(
             max_s = max(delays.values())
             reason = f"{describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
             return Deconfliction(
-                "corridors",
-                reason,
-                min_distance_m,
-                conflicts,
-                delays_s=delays,
-                slack_s=slack_s,
-                speed_m_s=speed_m_s,
+                "corridors", reason, min_distance_m, conflicts, delays_s=delays, slack_s=slack_s, speed_m_s=speed_m_s
             )
         blocked = delays.route
         refusal = f"{blocked.name} would have to wait for {delays.blocker} longer than {max_delay_s:g} s"

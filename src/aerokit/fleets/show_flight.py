@@ -40,14 +40,7 @@ if TYPE_CHECKING:
 
     TrackSample = tuple[float, LocalPoint]  # seconds since the start of the show, and metres north, east and up
 
-__all__ = [
-    "ClockOffset",
-    "ShowReport",
-    "TrackDeviation",
-    "max_relative_error",
-    "measure_clock",
-    "track_deviation",
-]
+__all__ = ["ClockOffset", "ShowReport", "TrackDeviation", "max_relative_error", "measure_clock", "track_deviation"]
 
 # Speed of the correction towards the track, per metre of deviation, in 1/s.
 TRACK_GAIN = 0.8

@@ -259,11 +259,7 @@ class Travel(SelectionBase):
         return await self._run(action, fly, stagger_s=options.stagger_s, names=names, corridors=corridors)
 
     async def _fly_in_layers(
-        self,
-        action: str,
-        targets: Mapping[str, Position],
-        options: FlightOptions,
-        heights_m: Mapping[str, float],
+        self, action: str, targets: Mapping[str, Position], options: FlightOptions, heights_m: Mapping[str, float]
     ) -> FleetResult:
         starts = {name: position_of(self._context.members[name]) for name in heights_m}
         climb = {name: _at_altitude(starts[name], height) for name, height in heights_m.items()}

@@ -76,17 +76,7 @@ INTEGER_RANGES = {
 class Field:
     """Description of one field of a message in the standard."""
 
-    __slots__ = (
-        "array_length",
-        "description",
-        "enum",
-        "extension",
-        "invalid",
-        "is_text",
-        "name",
-        "type",
-        "units",
-    )
+    __slots__ = ("array_length", "description", "enum", "extension", "invalid", "is_text", "name", "type", "units")
 
     def __init__(
         self,
@@ -368,13 +358,7 @@ class _Flags(enum.IntFlag):
 
 
 def make_enum(
-    module: str,
-    name: str,
-    bitmask: bool,
-    doc: str,
-    members: Iterable[tuple[str, int]],
-    *,
-    is_external: bool = False,
+    module: str, name: str, bitmask: bool, doc: str, members: Iterable[tuple[str, int]], *, is_external: bool = False
 ) -> type[Any]:
     """Create an ``IntFlag`` for a bitmask, else an ``IntEnum``. A second name for a value becomes an alias.
 

@@ -110,12 +110,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
     members = [(member, entry.value) for member, entry in enum.members()]
     try:
         return make_enum(
-            f"{__name__}.{dialect}",
-            enum.class_name,
-            enum.bitmask,
-            enum.description,
-            members,
-            is_external=True,
+            f"{__name__}.{dialect}", enum.class_name, enum.bitmask, enum.description, members, is_external=True
         )
     except (TypeError, ValueError) as error:  # The name of an entry occurs twice, or is reserved.
         raise InvalidArgument(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error

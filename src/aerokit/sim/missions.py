@@ -51,11 +51,7 @@ def float32(value: float) -> float:
         return float("inf") if value > 0 else float("-inf")
 
 
-_FILES = {
-    "mission.dat": MavMissionType.MISSION,
-    "fence.dat": MavMissionType.FENCE,
-    "rally.dat": MavMissionType.RALLY,
-}
+_FILES = {"mission.dat": MavMissionType.MISSION, "fence.dat": MavMissionType.FENCE, "rally.dat": MavMissionType.RALLY}
 # Parts of an upload that were not received are zero bytes, which decode as this item.
 _EMPTY = MissionItem(0, 0, autocontinue=False)
 _PLACEHOLDER_SIZE = 1 << 20

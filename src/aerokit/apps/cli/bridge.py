@@ -166,9 +166,7 @@ async def _publish(options: argparse.Namespace) -> int:
             opened(options) as connection,
             publisher_for(options.network) as publisher,
             vehicles_on(
-                connection,
-                rates=_rates(options),
-                on_found=lambda vehicle: _emit_vehicle(options, vehicle),
+                connection, rates=_rates(options), on_found=lambda vehicle: _emit_vehicle(options, vehicle)
             ) as vehicles,
         ):
             record = {"network": network, "address": options.address}

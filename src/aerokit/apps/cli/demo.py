@@ -33,11 +33,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_vehicle_kind(command, "copter or plane with ArduPilot, px4 or px4_plane (default: copter)")
     add_faults(command)
     command.add_argument(
-        "--altitude",
-        type=number(1, 500),
-        default=10.0,
-        metavar="M",
-        help="altitude above home in metres (default: 10)",
+        "--altitude", type=number(1, 500), default=10.0, metavar="M", help="altitude above home in metres (default: 10)"
     )
     command.add_argument(
         "--side", type=number(1, 5000), default=20.0, metavar="M", help="side of the square in metres (default: 20)"

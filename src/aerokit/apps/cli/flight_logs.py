@@ -90,10 +90,7 @@ def add_report_arguments(command: argparse.ArgumentParser) -> None:
         "-o", "--output", type=Path, metavar="OUT.html", help="output file (default: the name of the log, with .html)"
     )
     command.add_argument(
-        "--system",
-        type=int,
-        metavar="ID",
-        help="system id of the vehicle, if a .tlog has several (default: the first)",
+        "--system", type=int, metavar="ID", help="system id of the vehicle, if a .tlog has several (default: the first)"
     )
     add_force(command)
     command.add_argument("--open", action="store_true", help="open the report in the browser")

@@ -15,14 +15,7 @@ from aerokit.apps.cli.completion import kinds, set_completions
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.mission import PARTS, add_max_distance, begins_with_take_off, emit_items, read_plan, upload_parts
-from aerokit.apps.cli.output import (
-    DONE,
-    FAILED,
-    INTERRUPTED,
-    add_json,
-    emit,
-    new_recording,
-)
+from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
 from aerokit.apps.cli.supervised_flight import INTERRUPT_ACTIONS, FlightReport, SupervisedFlight
 from aerokit.apps.cli.terminal import InterruptStack, confirm, is_interactive, on_interrupt
 from aerokit.errors import AerokitError, InvalidArgument, NotSupported, OperationRejected

@@ -26,15 +26,7 @@ from aerokit.apps.cli.connecting import (
     opened,
     signing_of,
 )
-from aerokit.apps.cli.output import (
-    DONE,
-    FAILED,
-    INTERRUPTED,
-    can_print,
-    emit,
-    import_extra,
-    new_recording,
-)
+from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, can_print, emit, import_extra, new_recording
 from aerokit.apps.cli.terminal import on_interrupt, waiting
 from aerokit.apps.event_text import event_details
 from aerokit.errors import AerokitError, InvalidArgument
@@ -189,12 +181,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 def _emit_event(event: Event, unix_s: float, options: argparse.Namespace) -> None:
     details = {name: value for name, value in event.to_dict().items() if name not in ("at", "system_id")}
-    record = {
-        "time_unix_s": unix_s,
-        "system_id": event.system_id,
-        "event": type(event).__name__,
-        "details": details,
-    }
+    record = {"time_unix_s": unix_s, "system_id": event.system_id, "event": type(event).__name__, "details": details}
     time = datetime.fromtimestamp(unix_s, timezone.utc).astimezone()
     system = "  -" if event.system_id == 0 else f"{event.system_id:>3}"
     emit(options, "event", record, f"{time:%H:%M:%S}.{time.microsecond // 1000:03}  {system}  {_event_text(event)}")

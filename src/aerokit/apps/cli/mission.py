@@ -145,9 +145,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_parts(add_action(actions, "show", _show, "Show the vehicle's mission, fence or rally points."))
     download = add_action(actions, "download", _download, "Save the vehicle's plan to a file.")
     download.add_argument(
-        "file",
-        type=writable_file,
-        help=".plan (QGroundControl), or .waypoints or .txt (QGC WPL 110, the mission only)",
+        "file", type=writable_file, help=".plan (QGroundControl), or .waypoints or .txt (QGC WPL 110, the mission only)"
     )
     add_force(download)
     upload = add_action(

@@ -27,13 +27,7 @@ from aerokit.apps.cli.output import DONE, add_json, emit
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavComponent, MavType
-from aerokit.sim import (
-    ExtraComponent,
-    SimulatedCamera,
-    SimulatedGimbal,
-    SimulatedVehicle,
-    SimulatorServer,
-)
+from aerokit.sim import ExtraComponent, SimulatedCamera, SimulatedGimbal, SimulatedVehicle, SimulatorServer
 from aerokit.sim.kinds import kind_class, scale_timeouts, simulated
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 from aerokit.transport import create_link
@@ -202,9 +196,7 @@ class _DeviceOption(NamedTuple):
 _DEVICES: dict[str, _DeviceOption] = {
     "camera": _DeviceOption(6, lambda number: SimulatedCamera(100 + number), "camera (component 100 to 105)"),
     "gimbal": _DeviceOption(
-        6,
-        lambda number: SimulatedGimbal(170 + number if number else 154),
-        "gimbal (component 154, 171 to 175)",
+        6, lambda number: SimulatedGimbal(170 + number if number else 154), "gimbal (component 154, 171 to 175)"
     ),
     "companion": _DeviceOption(
         4,

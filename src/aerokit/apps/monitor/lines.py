@@ -302,9 +302,7 @@ class Canvas:
         width_dots = 2 * (self._columns - 1)
         height_dots = 4 * (self._rows - 1)
         self._metres_per_dot: float = max(
-            (max(easts) - min(easts)) / width_dots,
-            (max(norths) - min(norths)) / height_dots,
-            _MIN_SPAN_M / width_dots,
+            (max(easts) - min(easts)) / width_dots, (max(norths) - min(norths)) / height_dots, _MIN_SPAN_M / width_dots
         )
         self._dots: dict[tuple[int, int], int] = {}
         self._styles: dict[tuple[int, int], str] = {}

@@ -84,12 +84,7 @@ async def _close(session: Any) -> None:
 
 @checked
 async def discover(
-    fleet: str,
-    *,
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
-    config: str = "",
-    wait: float = 1.0,
+    fleet: str, *, connect: Sequence[str] = (), listen: Sequence[str] = (), config: str = "", wait: float = 1.0
 ) -> list[str]:
     """Return the names in a fleet that are on a zenoh network and can be opened as ``zenoh://FLEET/NAME``.
 

@@ -322,12 +322,7 @@ class HttpApi:
             get(f"{path}/parameters", "parameters", "All parameters of a vehicle", self._parameters, query=refresh),
             get(parameter_path, "parameter", "One parameter, read from the vehicle", self._parameter),
             get("/api/events", "events", "Recent events, the newest last", self._events),
-            get(
-                "/api/orders",
-                "orders",
-                "Orders and their results, the newest last",
-                self._list_orders,
-            ),
+            get("/api/orders", "orders", "Orders and their results, the newest last", self._list_orders),
             get("/api/orders/{key}", "order", "One order, by its Idempotency-Key", self._order),
             Operation("POST", "/api/plan", "plan", "Check a plan; sends nothing", self._check_plan, body_type=UPLOAD),
             *(self._order_operation("POST", f"{path}/{order_type.name}", order_type) for order_type in ORDERS),
@@ -471,9 +466,7 @@ class HttpApi:
         await _wait_until_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
         if record.problem is not None:
             return json_response(
-                {**record.problem, "order": record.to_dict()},
-                record.problem["status"],
-                "application/problem+json",
+                {**record.problem, "order": record.to_dict()}, record.problem["status"], "application/problem+json"
             )
         return json_response(record.to_dict(), 200 if record.state == "done" else 202)
 

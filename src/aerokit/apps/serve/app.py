@@ -122,12 +122,7 @@ def make_app(
     token = secrets.token_urlsafe(24) if token is None else token
     access = AccessControl(token, open_reading=open_reading, read_only=read_only)
     content_policy(tiles)  # raises if the URL is invalid
-    settings = {
-        "read_only": read_only,
-        "open_reading": open_reading,
-        "tiles": tiles,
-        "attribution": attribution,
-    }
+    settings = {"read_only": read_only, "open_reading": open_reading, "tiles": tiles, "attribution": attribution}
     return ServeApp(ServedVehicles(source), access, token, settings, hosts, metadata)
 
 

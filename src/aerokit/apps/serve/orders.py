@@ -252,10 +252,7 @@ ORDERS = (
     OrderType("hold", "Stop and hold position", _hold, is_safe=True),
     OrderType("land", "Land at the current position", lambda vehicle, _: vehicle.land(), is_safe=True),
     OrderType(
-        "return_to_launch",
-        "Return to the launch position",
-        lambda vehicle, _: vehicle.return_to_launch(),
-        is_safe=True,
+        "return_to_launch", "Return to the launch position", lambda vehicle, _: vehicle.return_to_launch(), is_safe=True
     ),
     OrderType("mode", "Change the flight mode", lambda vehicle, values: vehicle.set_mode(values["mode"]), _MODE),
     UPLOAD,

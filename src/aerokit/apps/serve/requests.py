@@ -82,10 +82,7 @@ def problem_response(error: Exception) -> Response:
 
 
 def json_response(
-    value: object,
-    status: int = 200,
-    media_type: str = "application/json",
-    headers: dict[str, str] | None = None,
+    value: object, status: int = 200, media_type: str = "application/json", headers: dict[str, str] | None = None
 ) -> Response:
     """Return a response with a JSON body that must not be cached."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False)

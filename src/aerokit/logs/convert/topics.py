@@ -75,13 +75,7 @@ POSE_IN_FRAME = _foxglove_object(
     pose=_foxglove_object("Pose", position=_VECTOR, orientation=_QUATERNION),
 )
 LOG = _foxglove_object(
-    "Log",
-    timestamp=_TIME,
-    level={"type": "integer"},
-    message=_TEXT,
-    name=_TEXT,
-    file=_TEXT,
-    line={"type": "integer"},
+    "Log", timestamp=_TIME, level={"type": "integer"}, message=_TEXT, name=_TEXT, file=_TEXT, line={"type": "integer"}
 )
 
 

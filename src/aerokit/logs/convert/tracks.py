@@ -159,11 +159,7 @@ class KmlWriter(_TrackWriter):
                 folder.newpoint(
                     name=_waypoint_name(waypoint),
                     coords=[
-                        (
-                            waypoint.longitude_deg,
-                            waypoint.latitude_deg,
-                            amsl_m if is_known else waypoint.altitude_m,
-                        )
+                        (waypoint.longitude_deg, waypoint.latitude_deg, amsl_m if is_known else waypoint.altitude_m)
                     ],
                     altitudemode=kml.AltitudeMode.absolute if is_known else kml.AltitudeMode.relativetoground,
                 )

@@ -110,10 +110,7 @@ class TangentPlane:
         return (latitude_deg - self.latitude_deg) * self.north_m_per_deg, east_deg * self.east_m_per_deg
 
     def degrees(self, north_m: float, east_m: float) -> tuple[float, float]:
-        return (
-            self.latitude_deg + north_m / self.north_m_per_deg,
-            self.longitude_deg + east_m / self.east_m_per_deg,
-        )
+        return (self.latitude_deg + north_m / self.north_m_per_deg, self.longitude_deg + east_m / self.east_m_per_deg)
 
 
 def battery_name(number: int) -> str:

@@ -200,10 +200,7 @@ def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> Sta
 
 def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> StateValues:
     yaw = (fields["Yaw"] + 180) % 360 - 180
-    return (
-        ("attitude", Attitude(fields["Roll"], fields["Pitch"], yaw)),
-        ("heading_deg", fields["Yaw"] % 360),
-    )
+    return (("attitude", Attitude(fields["Roll"], fields["Pitch"], yaw)), ("heading_deg", fields["Yaw"] % 360))
 
 
 def _finite_or_none(value: float) -> float | None:

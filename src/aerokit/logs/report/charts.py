@@ -139,10 +139,7 @@ def over_time(
     if not drawn:
         return None
     height = layout.pop("height", 300)
-    times = {
-        "title": {"text": "seconds since the start of the log"},
-        "range": time_range(0.0, flight.duration_s),
-    }
+    times = {"title": {"text": "seconds since the start of the log"}, "range": time_range(0.0, flight.duration_s)}
     full_layout = {"xaxis": times, "yaxis": {"title": {"text": unit}, **layout.pop("yaxis", {})}, **layout}
     without_colour = [trace for trace in drawn if "line" not in trace]
     for number, trace in enumerate(without_colour):
@@ -363,13 +360,7 @@ def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) 
 
 
 def _marker(
-    name: str,
-    places: Sequence[tuple[float, float]],
-    *,
-    symbol: str,
-    colour: str,
-    size: int,
-    texts: Sequence[str] = (),
+    name: str, places: Sequence[tuple[float, float]], *, symbol: str, colour: str, size: int, texts: Sequence[str] = ()
 ) -> dict[str, Any]:
     return {
         **_coordinates(places),

@@ -61,10 +61,7 @@ def _heights(flight: FlightLog) -> Section:
         flight,
         "heights",
         "metres above home",
-        [
-            setpoint_line("set-point", flight.position_target, relative),
-            line("actual", flight.track, relative),
-        ],
+        [setpoint_line("set-point", flight.position_target, relative), line("actual", flight.track, relative)],
     )
     explanation = "In all charts, background colours are modes, as in the map, and red lines are failsafes and falls."
     return _with_parts(Section("Height", explanation=explanation, missing="The log contains no heights."), chart)
@@ -127,8 +124,7 @@ def _attitude(flight: FlightLog) -> Section:
     )
     columns = {name: f"{name}_deg" for name in ("roll", "pitch", "yaw")}
     return _with_parts(
-        section,
-        *_actual_and_setpoint(flight, "attitude", "degrees", flight.attitude_target, flight.attitude, columns),
+        section, *_actual_and_setpoint(flight, "attitude", "degrees", flight.attitude_target, flight.attitude, columns)
     )
 
 
@@ -137,9 +133,7 @@ def _velocity(flight: FlightLog) -> Section:
     columns = {name: f"{name}_m_s" for name in ("north", "east", "down")}
     air = over_time(flight, "air", "air speed, m/s", [_air_speed_line(flight)], height=220)
     return _with_parts(
-        section,
-        *_actual_and_setpoint(flight, "velocity", "m/s", flight.velocity_target, flight.velocity, columns),
-        air,
+        section, *_actual_and_setpoint(flight, "velocity", "m/s", flight.velocity_target, flight.velocity, columns), air
     )
 
 
@@ -252,11 +246,7 @@ def _link(flight: FlightLog) -> Section:
     )
     lost = over_time(flight, "lost", "% lost", [line("lost", flight.link, "lost_percent", 1)], height=220)
     rate = over_time(
-        flight,
-        "received",
-        "messages per second",
-        [line("received", flight.link, "received_hz", 0)],
-        height=180,
+        flight, "received", "messages per second", [line("received", flight.link, "received_hz", 0)], height=180
     )
     radio = over_time(
         flight,
@@ -336,9 +326,7 @@ def _mission(flight: FlightLog) -> Section | None:
     if flight.autopilot == "ArduPilot":
         explanation = "Items are numbered from 0, without home. The numbers in ArduPilot's texts are one higher."
     return Section(
-        "Mission",
-        [Table(("item", "command", "position", "altitude"), rows, f"{len(rows)} items")],
-        explanation,
+        "Mission", [Table(("item", "command", "position", "altitude"), rows, f"{len(rows)} items")], explanation
     )
 
 

@@ -27,10 +27,7 @@ _COMMANDS_WITHOUT_PLACE = frozenset(int(Cmd[row["command"]]) for row in _ROWS if
 _ROI_COMMANDS = (Cmd.NAV_ROI, Cmd.DO_SET_ROI)
 _ROI_WITH_PLACE = (MavRoi.NONE, MavRoi.LOCATION)
 _ROI_WITHOUT_PLACE = (MavRoi.NONE, MavRoi.WPNEXT, MavRoi.WPINDEX)
-_INT_FRAMES: dict[int, int] = {
-    Frame.GLOBAL_INT: Frame.GLOBAL,
-    Frame.GLOBAL_RELATIVE_ALT_INT: Frame.GLOBAL_RELATIVE_ALT,
-}
+_INT_FRAMES: dict[int, int] = {Frame.GLOBAL_INT: Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT_INT: Frame.GLOBAL_RELATIVE_ALT}
 _AS_INT = {plain: int_frame for int_frame, plain in _INT_FRAMES.items()}
 _POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
 _NO_MISSION_COMMANDS = frozenset(
