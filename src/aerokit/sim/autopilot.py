@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from itertools import pairwise
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
@@ -243,19 +243,11 @@ class SimulatedAutopilot(SimulatedVehicle):
 _DISCHARGE_CURVE = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
 
 
-class _DischargeSegment(NamedTuple):
-    """Straight line between two neighbouring points of the discharge curve."""
-
-    low_percent: float
-    low_volts: float
-    volts_per_percent: float
-
-
-# The segments from full to empty.
+# Straight lines between neighbouring points, from full to empty: lower end in percent, its volts, volts per percent.
 _DISCHARGE_SEGMENTS = tuple(
-    _DischargeSegment(low, volts, (high_volts - volts) / (high - low))
-    for (low, volts), (high, high_volts) in pairwise(_DISCHARGE_CURVE)
+    (low, volts, (high_volts - volts) / (high - low)) for (low, volts), (high, high_volts) in pairwise(_DISCHARGE_CURVE)
 )[::-1]
+_RESISTANCE_OHM = 0.012
 
 
 class SimulatedBattery:
@@ -264,12 +256,9 @@ class SimulatedBattery:
     consumed_mah: float
     consumed_wh: float
 
-    def __init__(
-        self, capacity_mah: float = 3300.0, *, cells: int = 3, percent: float = 100.0, resistance_ohm: float = 0.012
-    ) -> None:
+    def __init__(self, capacity_mah: float = 3300.0, *, cells: int = 3, percent: float = 100.0) -> None:
         self.capacity_mah = capacity_mah
         self.cells = cells
-        self.resistance_ohm = resistance_ohm
         self.consumed_mah = 0.0
         """Charge in mAh that was consumed since power-on, as a current sensor counts it."""
         self.consumed_wh = 0.0
@@ -286,7 +275,7 @@ class SimulatedBattery:
 
     @property
     def voltage_v(self) -> float:
-        volts = self.cells * self._resting_cell_volts() - self.current_a * self.resistance_ohm
+        volts = self.cells * self._resting_cell_volts() - self.current_a * _RESISTANCE_OHM
         return volts if volts > 0.0 else 0.0
 
     def drain(self, current_a: float, dt: float) -> None:
@@ -297,7 +286,7 @@ class SimulatedBattery:
         self._charge_mah = max(0.0, self._charge_mah - used_mah)
 
     def _resting_cell_volts(self) -> float:
-        percent = 100.0 * self._charge_mah / self.capacity_mah
+        percent = self.percent
         for low_percent, low_volts, volts_per_percent in _DISCHARGE_SEGMENTS:
             if percent >= low_percent:
                 return low_volts + (min(percent, 100.0) - low_percent) * volts_per_percent

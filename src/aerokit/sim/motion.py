@@ -114,16 +114,26 @@ def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]
     return (north * gain_per_s, east * gain_per_s)
 
 
-def approach_speed(distance: float, gain: float, deceleration: float) -> float:
+def approach_speed(distance: float, deceleration: float) -> float:
     """Return the speed in m/s that lets a vehicle stop at a point ``distance`` metres away.
 
-    Near the point, the speed is ``gain`` (per second) times the distance. Farther away, the speed is that of a constant
+    Near the point, the speed is 1 m/s for each metre of distance. Farther away, it is that of a constant
     ``deceleration``.
     """
-    linear_distance = deceleration / (gain * gain)
-    if distance <= linear_distance:
-        return distance * gain
-    return math.sqrt(2.0 * deceleration * (distance - linear_distance / 2.0))
+    if distance <= deceleration:
+        return distance
+    return math.sqrt(2.0 * deceleration * (distance - deceleration / 2.0))
+
+
+def crosses(place: tuple[float, float], start: tuple[float, float], end: tuple[float, float]) -> bool:
+    """Return True if a ray from ``place`` to the north crosses the line from ``start`` to ``end``."""
+    place_north, place_east = place
+    start_north, start_east = start
+    end_north, end_east = end
+    if (start_east > place_east) == (end_east > place_east):
+        return False
+    share = (place_east - start_east) / (end_east - start_east)
+    return place_north < start_north + share * (end_north - start_north)
 
 
 @dataclass
@@ -243,8 +253,8 @@ class Motion:
         speed_per_metre = 0.0
         if distance > 1e-6:  # At the point, the direction is undefined.
             deceleration = BRAKING_SHARE * self.limits.acceleration_m_s2
-            speed_per_metre = min(speed, approach_speed(distance, 1.0, deceleration)) / distance
-        vertical = approach_speed(abs(offset_down), 1.0, BRAKING_SHARE * self.limits.vertical_acceleration_m_s2)
+            speed_per_metre = min(speed, approach_speed(distance, deceleration)) / distance
+        vertical = approach_speed(abs(offset_down), BRAKING_SHARE * self.limits.vertical_acceleration_m_s2)
         vertical = min(vertical, descent if offset_down > 0 else climb)
         velocity_down = math.copysign(vertical, offset_down)
         self.seek_velocity(offset_north * speed_per_metre, offset_east * speed_per_metre, velocity_down)

@@ -64,7 +64,7 @@ class SimParameters:
     def __init__(self, rows: Iterable[SimParameter]) -> None:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
         # Maps the name of a parameter to the name of the parameter that enables it.
-        self._switches = {row.name: row.switch for row in self._all_rows() if row.switch is not None}
+        self._switches = {row.name: row.switch for row in map(self.row, self._rows) if row.switch is not None}
         self._unlisted: frozenset[str] = frozenset()  # names that the list leaves out
         self._names: tuple[str, ...] | None = None  # None if they must be computed at the next access
         self._indices: dict[str, int] = {}
@@ -153,9 +153,6 @@ class SimParameters:
         del self._rows[name]
         self._switches.pop(name, None)
         self._names = None
-
-    def _all_rows(self) -> Iterator[SimParameter]:
-        return (self.row(name) for name in list(self._rows))
 
 
 def stored_value(value: float, type_: int) -> float:

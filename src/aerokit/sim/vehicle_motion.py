@@ -268,16 +268,13 @@ class GroundMotion(Motion):
         self._wanted_turn_rate = 0.0
         self._wanted_heading = heading
 
-    def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False) -> None:
+    def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True) -> None:
         """Drive to a point at up to this speed in m/s. With ``stops``, the rover brakes and stops at the point."""
         offset_north, offset_east = north - self.north, east - self.east
         distance = math.hypot(offset_north, offset_east)
         if stops:
-            speed = min(speed, approach_speed(distance, 1.0, self.wheels.acceleration_m_s2))
+            speed = min(speed, approach_speed(distance, self.wheels.acceleration_m_s2))
         course = math.atan2(offset_east, offset_north)
-        if backwards:
-            self.head(-speed, course + math.pi)  # The nose points away from the target.
-            return
         if abs(wrap_pi(course - self.yaw)) > _SLOW_TURN_ERROR_RAD:  # Drive slowly until the rover has turned.
             speed = min(speed, _SLOW_M_S)
         self.head(speed, course)

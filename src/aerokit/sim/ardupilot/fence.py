@@ -11,7 +11,7 @@ from aerokit.mavlink.enums import FenceBreach, FenceMitigate, FenceType, MavCmd,
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotMode, HostT
 from aerokit.sim.commands import ReceivedCommand, to_int
-from aerokit.sim.motion import LocalFrame, Ned
+from aerokit.sim.motion import LocalFrame, Ned, crosses
 
 _IN, _OUT = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION
 _CIRCLE_IN, _CIRCLE_OUT = MavCmd.NAV_FENCE_CIRCLE_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_EXCLUSION
@@ -80,7 +80,7 @@ class PolygonZone:
     def outside_m(self, place: Point) -> float:
         """Return the distance from the border in metres, which is negative inside."""
         distance = min(_distance_to_edge(place, start, end) for start, end in self._sides)
-        crossings = sum(_crosses(place, start, end) for start, end in self._sides)
+        crossings = sum(crosses(place, start, end) for start, end in self._sides)
         is_inside = crossings % 2 == 1  # A ray from a point inside crosses the border an odd number of times.
         return -distance if is_inside else distance
 
@@ -96,18 +96,6 @@ def _distance_to_edge(place: Point, start: Point, end: Point) -> float:
         projection = ((place_north - start_north) * north + (place_east - start_east) * east) / squared_length
         share = min(1.0, max(0.0, projection))
     return math.dist(place, (start_north + share * north, start_east + share * east))
-
-
-def _crosses(place: Point, start: Point, end: Point) -> bool:
-    """Return True if a ray from ``place`` to the north crosses the edge."""
-    place_north, place_east = place
-    start_north, start_east = start
-    end_north, end_east = end
-    is_start_to_the_east, is_end_to_the_east = start_east > place_east, end_east > place_east
-    if is_start_to_the_east == is_end_to_the_east:
-        return False
-    share = (place_east - start_east) / (end_east - start_east)
-    return place_north < start_north + share * (end_north - start_north)
 
 
 # Bits of FENCE_TYPE.

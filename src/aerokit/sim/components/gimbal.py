@@ -121,7 +121,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         """Return roll and pitch (from the horizon) and yaw (from the vehicle's nose) in radians."""
         max_change = self.slew_rad_s * (self.now - self._start_at)
         roll, pitch, yaw = (
-            _towards(start, target, max_change)
+            start + max(-max_change, min(max_change, target - start))
             for start, target in zip(self._start_angles, self._wanted_angles(), strict=True)
         )
         return (roll, pitch, yaw)
@@ -202,7 +202,3 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
 def _clamped(angle: float, limits: tuple[float, float]) -> float:
     low, high = limits
     return max(low, min(high, angle))
-
-
-def _towards(start: float, target: float, max_change: float) -> float:
-    return start + max(-max_change, min(max_change, target - start))

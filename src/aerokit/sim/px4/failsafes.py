@@ -9,7 +9,7 @@ cause, deferred failsafes, parachutes, predicted breaches (GF_PREDICT).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from aerokit.mavlink.enums import MavBatteryChargeState, MavMissionType, MavSeve
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
-from aerokit.sim.motion import Ned
+from aerokit.sim.motion import Ned, crosses
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, MODES, OFFBOARD, ORBIT, RTL, Px4Mode
@@ -94,13 +94,16 @@ class Px4Fence:
         return not inclusions or any(area.contains_point for area in inclusions)
 
     def _areas(self, north: float, east: float) -> Iterator[_Area]:
-        items, index = self._items(), 0
+        items, index = self._px4.missions.items(MavMissionType.FENCE), 0
         while index < len(items):
             item = items[index]
             if item.command in _POLYGONS:
                 count = max(1, int(item.param1))  # Param 1 of each corner is the number of corners.
                 corners = [self._place(corner) for corner in items[index : index + count]]
-                yield _Area(_POLYGONS[Cmd(item.command)], _is_in_polygon(corners, north, east))
+                sides = zip(corners, [corners[-1], *corners[:-1]], strict=True)
+                crossings = sum(crosses((north, east), corner, previous) for corner, previous in sides)
+                # A ray from a point inside crosses the border an odd number of times.
+                yield _Area(_POLYGONS[Cmd(item.command)], crossings % 2 == 1)
                 index += count
                 continue
             if item.command in _CIRCLES:
@@ -109,26 +112,8 @@ class Px4Fence:
                 yield _Area(_CIRCLES[Cmd(item.command)], is_in_circle)
             index += 1
 
-    def _items(self) -> Sequence[MissionItem]:
-        return self._px4.missions.items(MavMissionType.FENCE)
-
     def _place(self, item: MissionItem) -> tuple[float, float]:
         return self._px4.frame.to_local(round(item.x), round(item.y))
-
-
-def _is_in_polygon(corners: Sequence[tuple[float, float]], north: float, east: float) -> bool:
-    """Return True if a ray from the point to the north crosses the border an odd number of times."""
-    is_inside = False
-    previous_north, previous_east = corners[-1]
-    for corner_north, corner_east in corners:
-        side_spans_ray = (corner_east > east) != (previous_east > east)
-        if side_spans_ray:
-            share = (east - corner_east) / (previous_east - corner_east)
-            crossing_north = corner_north + share * (previous_north - corner_north)
-            if north < crossing_north:
-                is_inside = not is_inside
-        previous_north, previous_east = corner_north, corner_east
-    return is_inside
 
 
 _INTERVAL_S = 0.2

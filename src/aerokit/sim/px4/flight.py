@@ -276,5 +276,5 @@ def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
 
     The velocity is at most ``limit``. ``acceleration`` (m/s²) limits the braking.
     """
-    speed = approach_speed(abs(offset), 1.0, BRAKING_SHARE * acceleration)
+    speed = approach_speed(abs(offset), BRAKING_SHARE * acceleration)
     return math.copysign(min(limit, speed), offset)

@@ -292,7 +292,8 @@ class Px4Mission:
             return
         target = self._place(item)
         north, east, down = target
-        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None to look ahead
+        has_heading = item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
+        px4.flight.heading = math.radians(item.param4) if has_heading else None  # None to look ahead
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(down if item.command in _TAKE_OFFS else None)
         elif item.command in _LANDINGS:
@@ -311,9 +312,6 @@ class Px4Mission:
         px4.flight.target = (motion.north, motion.east, min(down, motion.down))
         if px4.is_armed:
             px4.info(f"Climb to {home_down - down:.1f} meters above home")
-
-    def _has_heading(self, item: MissionItem) -> bool:
-        return item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
 
     def _place(self, item: MissionItem) -> tuple[float, float, float]:
         px4, motion = self._px4, self._px4.motion
@@ -347,21 +345,28 @@ class Px4Mission:
             self._phase = "land"
             self._mark_reached()
         elif self._is_done(item):
-            self._mark_reached()
-            if item.autocontinue and self._advance():
-                self._begin_item()
+            self._complete_item(item)
+
+    def _complete_item(self, item: MissionItem) -> None:
+        self._mark_reached()
+        if item.autocontinue and self._advance():
+            self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
         if item.command == Cmd.NAV_DELAY:
             return True
         motion = self._px4.motion
         north, east, down = self._px4.flight.target
-        radius = self._px4.parameters["NAV_ACC_RAD"]
-        acceptance_radius = item.param2
-        if item.command == Cmd.NAV_WAYPOINT and acceptance_radius > 0:
-            radius = acceptance_radius
-        is_near = math.hypot(north - motion.north, east - motion.east) <= radius
-        return is_near and abs(down - motion.down) <= _HEIGHT_REACHED_M
+        is_near = math.hypot(north - motion.north, east - motion.east) <= self._acceptance_radius_m(item)
+        return is_near and abs(down - motion.down) <= self._height_tolerance_m
+
+    def _acceptance_radius_m(self, item: MissionItem) -> float:
+        has_own_radius = item.command == Cmd.NAV_WAYPOINT and item.param2 > 0
+        return item.param2 if has_own_radius else self._px4.parameters["NAV_ACC_RAD"]
+
+    @property
+    def _height_tolerance_m(self) -> float:
+        return _HEIGHT_REACHED_M
 
     def _is_done(self, item: MissionItem) -> bool:
         if item.command == Cmd.NAV_LOITER_UNLIM:

@@ -161,7 +161,7 @@ class Px4PlaneFlight(Px4Flight):
         if self._motion.down > target_down:
             return
         place = (self._motion.north, self._motion.east, target_down)
-        self._plane.switch_to_hold()  # This sets the target to the current altitude.
+        self._plane.switch_to(modes.HOLD)  # This sets the target to the current altitude.
         self.target = place
 
     def circle_down(self) -> None:
@@ -288,24 +288,17 @@ class Px4PlaneMission(Px4Mission):
         if self._is_done(item):
             self._complete_item(item)
 
-    def _complete_item(self, item: MissionItem) -> None:
-        self._mark_reached()
-        if item.autocontinue and self._advance():
-            self._begin_item()
-
-    def _is_at_target(self, item: MissionItem) -> bool:
-        if item.command == Cmd.NAV_DELAY:
-            return True
-        plane, motion = self._plane, self._plane.motion
-        north, east, down = plane.flight.target
+    def _acceptance_radius_m(self, item: MissionItem) -> float:
+        plane = self._plane
         # A fast plane must turn earlier.
-        radius = max(plane.parameters["NAV_ACC_RAD"], _TURN_LEAD_S * motion.airspeed_m_s)
+        radius = max(plane.parameters["NAV_ACC_RAD"], _TURN_LEAD_S * plane.motion.airspeed_m_s)
         if item.command == Cmd.NAV_WAYPOINT:
-            radius = max(radius, item.param2)
-        elif item.command in _CIRCLES:
-            radius += abs(plane.flight.radius_m)
-        is_near = math.hypot(north - motion.north, east - motion.east) <= radius
-        return is_near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
+            return max(radius, item.param2)
+        return radius + abs(plane.flight.radius_m) if item.command in _CIRCLES else radius
+
+    @property
+    def _height_tolerance_m(self) -> float:
+        return self._plane.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
         target = self._plane.flight.target
@@ -354,10 +347,6 @@ class SimulatedPx4Plane(SimulatedPx4):
 
     def _make_mission(self) -> Px4Mission:
         return Px4PlaneMission(self)
-
-    def switch_to_hold(self) -> None:
-        """Change to HOLD, because the take-off is complete."""
-        self.switch_to(modes.HOLD)
 
     def _is_moving(self) -> bool:
         return super()._is_moving() or self.flight.is_rolling
