@@ -77,7 +77,7 @@ class BackgroundTasks:
             self._on_error(error)
 
 
-async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
+async def run_shielded(work: Coroutine[Any, Any, object]) -> None:
     """Await ``work`` to its end, even if the caller is cancelled.
 
     The cancellation is raised afterwards. If the work has failed, its exception is the cause. The work must be bounded

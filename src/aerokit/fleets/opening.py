@@ -374,11 +374,8 @@ class MemberConnections:
         # If a task is still connecting, opening has failed, and cancelling all tasks is enough.
         are_all_connected = len(self._connected) == self._running_task_count
         if self._running_task_count and are_all_connected:
-            await run_shielded(self._wait_until_all_closed())
+            await run_shielded(self._all_closed.wait())
         await self._tasks.aclose()
-
-    async def _wait_until_all_closed(self) -> None:
-        await self._all_closed.wait()
 
     async def _run(self, system: _System) -> None:
         connection, system_id = system.connection, system.system_id

@@ -197,6 +197,21 @@ def __dir__() -> list[str]:
     return sorted(set(globals()) | set(_TABLE))
 """
 
+_LAZY_IMPORT = """
+__all__ = [*_MODULES]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(_MODULES))
+"""
+
 _ENUMS_INIT_TEMPLATE = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
 
@@ -210,19 +225,6 @@ from importlib import import_module
 
 _MODULES = {{
 {rows}}}
-
-__all__ = [*_MODULES]
-
-
-def __getattr__(name: str) -> object:
-    if name not in _MODULES:
-        raise AttributeError(f"module {{__name__!r}} has no attribute {{name!r}}")
-    value = globals()[name] = getattr(import_module(f"{{__name__}}.{{_MODULES[name]}}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(set(globals()) | set(_MODULES))
 '''
 
 _MESSAGES_INIT_TEMPLATE = '''# pyright: reportUnsupportedDunderAll=false
@@ -242,19 +244,6 @@ INDEX: dict[int, tuple[str, str, int, int, int]] = {{
 {rows}}}
 
 _MODULES = {{row[0]: row[1] for row in INDEX.values()}}
-
-__all__ = [*_MODULES]
-
-
-def __getattr__(name: str) -> object:
-    if name not in _MODULES:
-        raise AttributeError(f"module {{__name__!r}} has no attribute {{name!r}}")
-    value = globals()[name] = getattr(import_module(f"{{__name__}}.{{_MODULES[name]}}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(set(globals()) | set(_MODULES))
 '''
 
 
@@ -377,7 +366,7 @@ def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
         rows += f'    {message.id}: ("{message.class_name}", "{_module_of(message)}", {numbers}),\n'
     names = {message.class_name: _module_of(message) for message in messages}
     stub = _reexports("messages", names) + "\nINDEX: dict[int, tuple[str, str, int, int, int]]\n"
-    return _MESSAGES_INIT_TEMPLATE.format(rows=rows), stub
+    return _MESSAGES_INIT_TEMPLATE.format(rows=rows) + _LAZY_IMPORT, stub
 
 
 def _enums_module(module: str, stems: Sequence[str], enums: Sequence[EnumDefinition]) -> str:
@@ -395,7 +384,7 @@ def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
     modules = {stem: module for module, stems in MODULES.items() for stem in stems}
     names = {enum.class_name: modules[enum.origin] for enum in enums}
     rows = "".join(f'    "{name}": "{module}",\n' for name, module in sorted(names.items()))
-    return _ENUMS_INIT_TEMPLATE.format(rows=rows), _reexports("enums", names)
+    return _ENUMS_INIT_TEMPLATE.format(rows=rows) + _LAZY_IMPORT, _reexports("enums", names)
 
 
 def _reexports(package: str, names: dict[str, str]) -> str:

@@ -21,8 +21,9 @@ _MAX_UNPACKED_LENGTH = 4
 
 def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
     """Render the class of one message with its Struct. ``docs=False`` keeps only the first docstring line."""
+    struct_format = "<" + "".join(_struct_code(field) for field in message.wire_fields)
     lines = [
-        f"_S{message.id} = Struct({_struct_format(message)!r})",
+        f"_S{message.id} = Struct({struct_format!r})",
         "",
         "",
         f"class {message.class_name}(Message):",
@@ -167,10 +168,6 @@ def _struct_code(field: FieldDefinition) -> str:
     if field.type == "char" or (field.type == "uint8_t" and field.array_length):
         return f"{field.array_length or 1}s"
     return f"{field.array_length or ''}{STRUCT_CODES[field.type]}"
-
-
-def _struct_format(message: MessageDefinition) -> str:
-    return "<" + "".join(_struct_code(field) for field in message.wire_fields)
 
 
 def _is_tuple(field: FieldDefinition) -> bool:

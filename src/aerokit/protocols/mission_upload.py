@@ -220,14 +220,10 @@ class MissionUpload(MissionExchange[UploadResult]):
                     self._wait(now)
         elif result == MavMissionResult.OPERATION_CANCELLED:
             self._restart(result, now)
-        elif result == MavMissionResult.ERROR and not self._is_refusal_of_partial_upload:
+        elif result == MavMissionResult.ERROR and (self._is_requesting or not self.is_partial):
             self._on_error(now)
         else:
             self._fail_as_refused(result)
-
-    @property
-    def _is_refusal_of_partial_upload(self) -> bool:
-        return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
         # ERROR need not mean that the upload has failed. PX4 also sends it when it is busy, when MISSION_COUNT arrives

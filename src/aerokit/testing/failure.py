@@ -12,7 +12,6 @@ from aerokit.testing.picture import save_picture
 
 if TYPE_CHECKING:
     from aerokit.testing.flights import Flight
-    from aerokit.testing.journal import SentText
     from aerokit.testing.served import ServedFlight
 
 _MAX_TEXTS = 6
@@ -57,11 +56,7 @@ def _describe_flight(flight: Flight | ServedFlight) -> list[str]:
         f" up to {track.max_altitude_m:.1f} m high and {track.max_distance_m:.1f} m away",
         f"  ended {track.end}",
     ]
-    return [*lines, *_text_lines(flight.journal.texts)]
-
-
-def _text_lines(texts: Sequence[SentText]) -> list[str]:
-    return [f"  text at {text}" for text in texts[-_MAX_TEXTS:]]
+    return [*lines, *(f"  text at {text}" for text in flight.journal.texts[-_MAX_TEXTS:])]
 
 
 def _path(test: str, directory: Path, ending: str) -> Path:

@@ -188,7 +188,6 @@ class FaultyLink(Link):
         return self.link.unsent_bytes + queued_bytes
 
     def discard_unsent(self) -> None:
-        """See `Link.discard_unsent`."""
         if self._stalled_queue is not None:
             self._stalled_queue.discard()
         self.link.discard_unsent()
@@ -211,7 +210,6 @@ class FaultyLink(Link):
             self._on_stalled(False)  # A queue that a second `stall` replaced does not report the end of its stall.
 
     async def open(self, receiver: Receiver) -> None:
-        """See `Link.open`."""
         if self._is_closed:
             raise ConnectionClosed(f"{self.address} was closed and cannot be opened again; make a new link")
         if self._incoming_path is not None:
@@ -247,19 +245,15 @@ class FaultyLink(Link):
             in_flight.put(due, partial(self.link.write, piece, peer))
 
     def keep_peer(self, peer: Peer) -> None:
-        """See `Link.keep_peer`."""
         self.link.keep_peer(peer)
 
     def forget_peer(self, peer: Peer) -> None:
-        """See `Link.forget_peer`."""
         self.link.forget_peer(peer)
 
     def host_of(self, peer: Peer) -> object:
-        """See `Link.host_of`."""
         return self.link.host_of(peer)
 
     def has_peer(self, peer: Peer) -> bool:
-        """See `Link.has_peer`."""
         return self.link.has_peer(peer)
 
     def close(self) -> None:
@@ -283,7 +277,6 @@ class FaultyLink(Link):
         in_flight.put(min(in_flight.latest_due, latest_close), self._close_link)
 
     async def wait_closed(self) -> None:
-        """See `Link.wait_closed`."""
         await self._delivered.wait()
         await self.link.wait_closed()
 

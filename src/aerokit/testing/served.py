@@ -46,7 +46,6 @@ class ServedFlight:
         """Injects faults."""
         self.recording: FlightRecording | None = recording
         """Recording of the vehicle's link; None without ``record=True``."""
-        self._portal = portal
         self._server = server
         self._scheduler = scheduler
         self._interruption = interruption

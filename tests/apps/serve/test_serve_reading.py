@@ -19,8 +19,7 @@ import aerokit
 from aerokit.apps.readiness import readiness
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
-from aerokit.apps.serve.failsafe import ground_station_failsafe
-from aerokit.apps.serve.served_vehicles import _thin_out
+from aerokit.apps.serve.served_vehicles import _thin_out, ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument

@@ -129,12 +129,8 @@ class PlanFlight(SupervisedFlight):
             )
         return warnings
 
-    @property
-    def _needs_confirmation(self) -> bool:
-        return not (self._options.sim or self._options.yes)
-
     async def _is_confirmed(self) -> bool:
-        if not self._needs_confirmation:
+        if self._options.sim or self._options.yes:
             return True
         vehicle = self._vehicle
         name = f"{vehicle.autopilot.firmware}, system {vehicle.system_id}"

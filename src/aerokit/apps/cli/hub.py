@@ -107,7 +107,8 @@ async def _hub(options: argparse.Namespace) -> int:
             if options.record is not None:
                 hub.record(options.record)
             record = {"endpoints": [endpoint.address for endpoint in hub.endpoints], "file": options.record}
-            text = f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, {_how_long(options)}"
+            how_long = "until Ctrl-C" if options.seconds is None else f"for {options.seconds:g} s"
+            text = f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, {how_long}"
             emit(options, "hub", record, text)
             with anyio.move_on_after(options.seconds):
                 while not stop.is_set():
@@ -118,10 +119,6 @@ async def _hub(options: argparse.Namespace) -> int:
             _emit_statistics(options, hub)  # totals since the start
     # Without --seconds, Ctrl-C is the normal end of the command.
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
-
-
-def _how_long(options: argparse.Namespace) -> str:
-    return "until Ctrl-C" if options.seconds is None else f"for {options.seconds:g} s"
 
 
 def _endpoints(options: argparse.Namespace) -> list[Endpoint]:

@@ -67,22 +67,11 @@ class FlightWatch:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
-        self._detector = ImpactDetector(vehicle.telemetry)
-        self._crash: dict[str, Any] | None = None
+        self._reset()
         # The last descent at IMPACT_M_S or faster.
         self._last_sink_at = -math.inf
         self._last_sink_m_s = 0.0
-        # The last impact; None if there was none.
-        self._impact_at: float | None = None
-        self._impact_altitude_m: float | None = None
-        self._was_sudden_stop = False
-        self._is_impact_dismissed = False
-        # Start of the time without motion after the impact, and number of velocity reports since then.
-        self._still_since = math.inf
-        self._still_samples = 0
-        # Set after a crash: start of a movement, and altitude at which the vehicle reported a take-off.
-        self._moving_since = math.inf
-        self._take_off_altitude_m: float | None = None
+        self._was_sudden_stop = False  # whether the last impact was one
         self._armed_at: float | None = None  # None if the time of arming is unknown
         self._disarmed_at = -math.inf
         self._was_in_air = False  # True if the vehicle was in the air since the last arming
@@ -93,6 +82,23 @@ class FlightWatch:
             vehicle.armed.observe(self._on_armed),
             vehicle.landed_state.observe(self._on_landed),
         )
+
+    def _forget_impact(self) -> None:
+        self._crash: dict[str, Any] | None = None
+        # The last impact; None if there was none.
+        self._impact_at: float | None = None
+        self._impact_altitude_m: float | None = None
+        self._is_impact_dismissed = False
+        # Start of the time without motion after the impact, and number of velocity reports since then.
+        self._still_since = math.inf
+        self._still_samples = 0
+        # Set after a crash: start of a movement, and altitude at which the vehicle reported a take-off.
+        self._moving_since = math.inf
+        self._take_off_altitude_m: float | None = None
+
+    def _reset(self) -> None:
+        self._forget_impact()
+        self._detector = ImpactDetector(self._vehicle.telemetry)
 
     def close(self) -> None:
         for detach in self._detachments:
@@ -255,20 +261,6 @@ class FlightWatch:
     def _dismiss_impact(self) -> None:
         self._is_impact_dismissed = True
         self._crash = None
-
-    def _forget_impact(self) -> None:
-        self._crash = None
-        self._impact_at = None
-        self._impact_altitude_m = None
-        self._is_impact_dismissed = False
-        self._still_since = math.inf
-        self._still_samples = 0
-        self._moving_since = math.inf
-        self._take_off_altitude_m = None
-
-    def _reset(self) -> None:
-        self._forget_impact()
-        self._detector = ImpactDetector(self._vehicle.telemetry)
 
     def _now(self) -> float:
         return self._vehicle.connection.now()

@@ -16,9 +16,9 @@ import anyio
 
 from aerokit._internal.formatting import to_jsonable
 from aerokit.apps.readiness import ArmingCheckRequests, active_failsafe, not_armable, run_arming_checks, unarmable_mode
-from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.apps.serve.requests import HttpProblem
+from aerokit.autopilots.failsafes import gcs_failsafe
 from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import AerokitError, InvalidArgument
@@ -264,3 +264,20 @@ def _is_flying_mission(vehicle: Vehicle) -> bool:
     """Return True if the vehicle is in its mission mode and not known to be disarmed."""
     mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
     return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed
+
+
+def ground_station_failsafe(vehicle: Vehicle) -> dict[str, Any]:
+    """Return what the vehicle does after the loss of the ground station. Requests nothing.
+
+    ``action`` is a part of a sentence, such as ``lands``, or None if it is unknown. ``because`` is the parameter that
+    sets the action, with its value. If the value is not known yet, ``unread`` has the name of the parameter.
+    """
+
+    def value_of(name: str) -> float | None:
+        parameter = vehicle.parameters.known(name)
+        return None if parameter is None else parameter.value
+
+    name, action = gcs_failsafe(vehicle.autopilot.firmware, value_of)
+    if name is None or action is None:
+        return {"action": None, "because": None, "unread": [] if name is None else [name]}
+    return {"action": action, "because": f"{name} = {value_of(name):g}", "unread": []}

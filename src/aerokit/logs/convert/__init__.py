@@ -5,19 +5,18 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from aerokit._internal.values import Snapshot
-from aerokit.errors import FileFormatError, InvalidArgument
+from aerokit.errors import InvalidArgument
 from aerokit.logs.convert.mcap import McapWriter
 from aerokit.logs.convert.tables import CsvTable, FlightTableWriter, MessageTablesWriter, ParquetTable
 from aerokit.logs.convert.tracks import GpxWriter, KmlWriter
+from aerokit.logs.flights import check_log_name, progress_callback
 from aerokit.logs.flights.flight_controllers import BinReader, UlogReader
 from aerokit.logs.flights.records import TlogReader
-from aerokit.protocols.exchange import TransferProgress
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -107,22 +106,20 @@ def convert(
     source, target_path = Path(log), Path(target)
     make_writer = _writer_for(target_path, tables)
     is_folder = not target_path.suffix
-    reader_class = LOG_READERS.get(source.suffix.lower())
-    if reader_class is None:
-        raise FileFormatError(f"{source} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
+    check_log_name(source)
     is_empty_folder = is_folder and target_path.is_dir() and not any(target_path.iterdir())
     if not force and target_path.exists() and not is_empty_folder:
         raise InvalidArgument(f"{target_path} exists; use force (--force) to replace it")
     if target_path.exists() and target_path.is_dir() != is_folder:
         existing, new = ("file", "folder") if is_folder else ("folder", "file")
         raise InvalidArgument(f"{target_path} is a {existing} and cannot be replaced by a {new}")
-    on_bytes = _progress_callback(source, on_progress)
+    on_bytes = progress_callback(source, on_progress)
     # The temporary folder is in the target's directory, because renaming works only within one file system.
     with tempfile.TemporaryDirectory(dir=target_path.parent, prefix=f".{target_path.name}.") as folder:
         incomplete = Path(folder) / target_path.name
         if is_folder:
             incomplete.mkdir()
-        log_reader = reader_class(source)
+        log_reader = LOG_READERS[source.suffix.lower()](source)
         writer = make_writer(incomplete, log_reader)
         entries, begins_at, ends_at, written = _write_records(log_reader, writer, on_bytes)
         size = _move(incomplete, target_path)
@@ -159,13 +156,6 @@ def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], ob
         writer.discard()
         raise
     return entries, begins_at, ends_at, writer.written
-
-
-def _progress_callback(source: Path, on_progress: OnProgress | None) -> Callable[[int], object]:
-    total, started = source.stat().st_size, time.monotonic()
-    if on_progress is None:
-        return lambda done: None
-    return lambda done: on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
 
 
 def _move(complete: Path, target: Path) -> int:

@@ -63,6 +63,14 @@ def check_log_name(path: Path) -> None:
         raise FileFormatError(f"{path} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
 
 
+def progress_callback(path: Path, on_progress: OnProgress | None) -> Callable[[int], object]:
+    """Return a function that reports the number of bytes read so far to ``on_progress``."""
+    total, started = path.stat().st_size, time.monotonic()
+    if on_progress is None:
+        return lambda done: None
+    return lambda done: on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
+
+
 def read_flight(
     log: str | os.PathLike[str], *, system_id: int | None = None, on_progress: OnProgress | None = None
 ) -> FlightLog:
@@ -83,17 +91,12 @@ def read_flight(
     path = Path(log)
     check_log_name(path)
     read = LOG_READERS[path.suffix.lower()]
-    total, started = path.stat().st_size, time.monotonic()
-
-    def report_progress(done: int) -> None:
-        if on_progress is not None:
-            on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
-
+    report_progress = progress_callback(path, on_progress)
     report_progress(0)
     flight = FlightLog(path)
     read(flight, system_id, report_progress)
     _complete(flight)
-    report_progress(total)
+    report_progress(path.stat().st_size)
     return flight
 
 

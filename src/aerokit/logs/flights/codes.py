@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from aerokit.autopilots.gcs_failsafe import GCS_FAILSAFE_ACTIONS
+from aerokit.autopilots.failsafes import GCS_FAILSAFE_ACTIONS
 
 MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     1: ("radio control", None, False),

@@ -7,7 +7,7 @@ import re
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.values import Snapshot
-from aerokit.autopilots.failsafe_texts import failsafe_kind
+from aerokit.autopilots.failsafes import failsafe_kind
 from aerokit.logs.flights.codes import failsafe_action
 from aerokit.logs.flights.flight import FailsafeEvidence, TangentPlane, battery_name
 from aerokit.mavlink.enums import GpsFixType

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.autopilots.gcs_failsafe import GCS_FAILSAFE_ACTIONS, gcs_failsafe
+from aerokit.autopilots.failsafes import GCS_FAILSAFE_ACTIONS, gcs_failsafe
 from aerokit.logs.report.formatting import clock, span
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
 from aerokit.sim.ardupilot.host import RC_THROTTLE
-from aerokit.sim.ardupilot.mission_run import MissionCommand, MissionMode, horizontal_distance, set_home_from
+from aerokit.sim.ardupilot.mission_run import MissionCommand, MissionMode, horizontal_distance, place_of, set_home_from
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
@@ -367,15 +367,7 @@ class CopterAuto(MissionMode):
         current: Ned = self.vehicle.motion.place
         if isinstance(self._leg, _FlyLeg) and self._leg.is_complete:
             current = self._leg.destination  # more exact than the copter's position, which differs a little
-        point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
-        if point is None:
-            return current
-        north, east, down = point
-        if (item.x, item.y) == (0, 0):
-            north, east, _ = current
-        if item.z == 0:
-            _, _, down = current
-        return (north, east, down)
+        return place_of(self.vehicle, item, current)
 
     def _go(self, place: Ned, *, stops: bool = True) -> None:
         self._reached_at = None

@@ -384,6 +384,16 @@ def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
     return math.hypot(north - vehicle.motion.north, east - vehicle.motion.east)
 
 
+def place_of(vehicle: ArduPilotHost, item: MissionItem, current: Ned) -> Ned:
+    """Return the place of an item. ``current`` replaces coordinates or an altitude of 0, and an invalid place."""
+    north, east, down = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or current
+    if (item.x, item.y) == (0, 0):
+        north, east, _ = current
+    if item.z == 0:
+        _, _, down = current
+    return (north, east, down)
+
+
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
     """Execute DO_SET_HOME of a mission."""
     point: Ned | None = vehicle.motion.place

@@ -17,7 +17,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, set_home_from
+from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, place_of, set_home_from
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, PositionTarget, ReceivedCommand, Setpoint, is_finite, rotated
@@ -285,20 +285,13 @@ class RoverSubAuto(MissionMode):
 
     def _go(self, item: MissionItem) -> None:
         vehicle = self.vehicle
-        current: Ned = self._place or vehicle.motion.place
+        current: Ned = self._place or vehicle.motion.place  # where the previous command ended
         self._reached_at = None
         if item.command == Cmd.NAV_RETURN_TO_LAUNCH:
             self._place = vehicle.navigation.home or current
             self._stops = True
             return
-        # If the position is invalid or the coordinates are 0, use `current`, where the previous command ended.
-        point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or current
-        north, east, down = point
-        if (item.x, item.y) == (0, 0):
-            north, east, _ = current
-        if item.z == 0:
-            _, _, down = current
-        self._place = (north, east, down)
+        self._place = place_of(vehicle, item, current)
         following = next(vehicle.mission.navigation_from(vehicle.mission.nav_index + 1), None)
         is_waypoint_next = following is not None and following.item.command in _WAYPOINTS
         has_delay = item.param1 > 0

@@ -119,12 +119,10 @@ class CameraBody(SimulatedComponent, CameraDevice):
 
     @property
     def zoom(self) -> float:
-        """Zoom in percent."""
         return self.lens.zoom.percent
 
     @property
     def focus(self) -> float:
-        """Focus in percent."""
         return self.lens.focus.percent
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from aerokit.autopilots.failsafe_texts import failsafe_kind
+from aerokit.autopilots.failsafes import failsafe_kind
 from aerokit.vehicle.state.condition import StatusText
 
 if TYPE_CHECKING:
