@@ -22,15 +22,10 @@ from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 class ParameterServer(servers.ParameterProtocolServer):
     """Base of the parameter servers, which answer parameter requests. The `Faults` of the vehicle apply."""
 
-    def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        parameters: SimParameters,
-        *,
-        list_rate_hz: float = 1000.0,
-        sends_errors: bool = True,
-    ) -> None:
-        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
+    LIST_RATE_HZ = 1000.0
+
+    def __init__(self, vehicle: SimulatedVehicle, parameters: SimParameters, *, sends_errors: bool) -> None:
+        super().__init__(vehicle, parameters, list_rate_hz=self.LIST_RATE_HZ)
         self.sends_errors = sends_errors
         self._vehicle = vehicle
         self._parameters = parameters
@@ -66,16 +61,17 @@ class ArduPilotParameterServer(ParameterServer):
     The banner texts are sent before a list.
     """
 
+    LIST_RATE_HZ = 2000.0
+
     def __init__(
         self,
         vehicle: SimulatedVehicle,
         parameters: SimParameters,
         *,
-        list_rate_hz: float = 2000.0,
-        sends_errors: bool = False,
-        send_banner: Callable[[], None] = lambda: None,
+        sends_errors: bool,
+        send_banner: Callable[[], None],
     ) -> None:
-        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz, sends_errors=sends_errors)
+        super().__init__(vehicle, parameters, sends_errors=sends_errors)
         self._send_banner = send_banner
         self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()  # read requests that wait for their answer
         self._is_reading = False  # True while a call of `_read_next` is pending

@@ -269,7 +269,6 @@ class SimulatorServer:
             self._timer_at += skipped_s
 
     def _loop_time(self, due: float) -> float:
-        """Convert simulated time to loop time."""
         return self._started_at + (due - self._now_at_start) / self._speedup
 
 

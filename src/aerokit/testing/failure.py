@@ -24,9 +24,7 @@ def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], tes
     begin with the name of the test.
     """
     flights = _flatten(opened)
-    lines: list[str] = []
-    for flight in flights:
-        lines += _describe(flight)
+    lines = [line for flight in flights for line in _describe(flight)]
     if directory is not None:
         lines.append(_write_picture(flights, test, Path(directory)))
         lines += _write_recordings(flights, test, Path(directory))
@@ -42,21 +40,17 @@ def _flatten(opened: Iterable[SimulatedFleet | Flight | ServedFlight]) -> list[F
 
 def _describe(flight: Flight | ServedFlight) -> list[str]:
     try:
-        return _describe_flight(flight)
+        track = flight.track
+        if not track:  # The track has no points.
+            return [f"{track.name}: not switched on"]
+        return [
+            f"{track.name}: {' → '.join(track.modes)}, armed for {track.armed_s:.1f} s,"
+            f" up to {track.max_altitude_m:.1f} m high and {track.max_distance_m:.1f} m away",
+            f"  ended {track.end}",
+            *(f"  text at {text}" for text in flight.journal.texts[-_MAX_TEXTS:]),
+        ]
     except Exception as error:  # An exception of the simulated vehicle must not prevent the report.
         return [f"{flight.simulated!r} fails: {error!r}"]
-
-
-def _describe_flight(flight: Flight | ServedFlight) -> list[str]:
-    track = flight.track
-    if not track:  # The track has no points.
-        return [f"{track.name}: not switched on"]
-    lines = [
-        f"{track.name}: {' → '.join(track.modes)}, armed for {track.armed_s:.1f} s,"
-        f" up to {track.max_altitude_m:.1f} m high and {track.max_distance_m:.1f} m away",
-        f"  ended {track.end}",
-    ]
-    return [*lines, *(f"  text at {text}" for text in flight.journal.texts[-_MAX_TEXTS:])]
 
 
 def _path(test: str, directory: Path, ending: str) -> Path:

@@ -48,9 +48,9 @@ class FaultModel(Snapshot):
 
     def _check(self) -> None:
         for name in _SHARES:
-            _check_number(name, getattr(self, name), 0.0, 1.0)
+            _check_number(name, getattr(self, name), 1.0)
         for name in _SECONDS:
-            _check_number(name, getattr(self, name), 0.0, _MAX_SECONDS)
+            _check_number(name, getattr(self, name), _MAX_SECONDS)
         for name in ("bandwidth", "queue_bytes"):
             if not getattr(self, name) > 0:
                 raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not allowed: it must be above 0")
@@ -203,6 +203,6 @@ def _end_of_frame(data: bytes, begin: int) -> int | None:
     return begin + 10 + payload_length + 2 + signature_length  # 10 bytes of header and 2 bytes of checksum
 
 
-def _check_number(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be {low:g} to {high:g}")
+def _check_number(name: str, value: float, high: float) -> None:
+    if not 0.0 <= value <= high:
+        raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be 0 to {high:g}")

@@ -171,7 +171,6 @@ class MissionRun:
             index = command.seq + 1
 
     def _next_navigation(self, index: int) -> MissionCommand | None:
-        """Return the next navigation command from ``index`` on."""
         for _ in range(1 + _MAX_STEPS):
             command = self._next(index, count_jumps=False)
             if command is None or is_navigation(command.item):
