@@ -376,10 +376,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
 
 
 def opened(
-    twin: type[TwinT],
-    open_async: Callable[..., AbstractAsyncContextManager[Any]],
-    address: Any,
-    **options: Any,
+    twin: type[TwinT], open_async: Callable[..., AbstractAsyncContextManager[Any]], address: Any, **options: Any
 ) -> TwinT:
     """Open a context on a new loop thread; if ``address`` is a connection, on the connection's loop thread."""
     is_connection = isinstance(address, ConnectionTwin)

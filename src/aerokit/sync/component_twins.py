@@ -159,8 +159,7 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
         self._loop.call(self.aio.replace, items, kind)
 
     def on_upload(
-        self,
-        function: Callable[[str, tuple[MissionItem, ...]], Any],
+        self, function: Callable[[str, tuple[MissionItem, ...]], Any]
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
@@ -281,12 +280,7 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         )
 
     def send_landing_target(
-        self,
-        right_deg: float,
-        down_deg: float,
-        distance_m: float,
-        *,
-        target_number: int = 0,
+        self, right_deg: float, down_deg: float, distance_m: float, *, target_number: int = 0
     ) -> None:
         """Send the direction and distance of a landing beacon relative to the vehicle's body (LANDING_TARGET).
 

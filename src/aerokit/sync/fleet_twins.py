@@ -233,22 +233,11 @@ class Selection(SelectionTwin["AsyncSelection"]):
             ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.run(
-            self.aio.fly_show,
-            show,
-            origin,
-            rate_hz=rate_hz,
-            start_in_s=start_in_s,
-            lead_s=lead_s,
-            speed_m_s=speed_m_s,
+            self.aio.fly_show, show, origin, rate_hz=rate_hz, start_in_s=start_in_s, lead_s=lead_s, speed_m_s=speed_m_s
         )
 
     def form(
-        self,
-        formation: Formation,
-        *,
-        leader: str,
-        speed_m_s: float | None = None,
-        timeout: float | None = None,
+        self, formation: Formation, *, leader: str, speed_m_s: float | None = None, timeout: float | None = None
     ) -> FleetResult:
         """Fly each follower to its place around the leader, which stays where it is; see :meth:`go_to`.
 
@@ -266,12 +255,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
     def following(
-        self,
-        formation: Formation,
-        *,
-        leader: str,
-        rate_hz: float = 5.0,
-        max_speed_m_s: float = 10.0,
+        self, formation: Formation, *, leader: str, rate_hz: float = 5.0, max_speed_m_s: float = 10.0
     ) -> Following:
         """Keep a formation while the leader moves: ``async with fleet.following(formation, leader="north/1"):``.
 
@@ -318,11 +302,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             FleetError: an upload failed; ``start_missions`` will start no mission.
         """
         return self._loop.run(
-            self.aio.upload,
-            missions,
-            max_concurrent=max_concurrent,
-            max_distance_m=max_distance_m,
-            timeout=timeout,
+            self.aio.upload, missions, max_concurrent=max_concurrent, max_distance_m=max_distance_m, timeout=timeout
         )
 
     def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
@@ -350,10 +330,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.wait_missions_finished, timeout=timeout)
 
     def compare_missions(
-        self,
-        missions: Mapping[str, Mission],
-        *,
-        min_distance_m: float | None = None,
+        self, missions: Mapping[str, Mission], *, min_distance_m: float | None = None
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
@@ -470,11 +447,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
     def barrier(
-        self,
-        condition: Callable[[Member], bool],
-        *,
-        timeout: float = 60.0,
-        description: str = "barrier",
+        self, condition: Callable[[Member], bool], *, timeout: float = 60.0, description: str = "barrier"
     ) -> FleetResult:
         """Wait until a condition has been true for every available member, not necessarily at the same time.
 
@@ -571,10 +544,7 @@ class Fleet(FleetTwin, Selection):
         return self._loop.call(self.aio.send_corrections, rtcm)
 
     def events(
-        self,
-        *types: type[Event],
-        capacity: int = 1000,
-        overflow: Overflow = "drop_oldest",
+        self, *types: type[Event], capacity: int = 1000, overflow: Overflow = "drop_oldest"
     ) -> Subscription[FleetEvent]:
         """Subscribe to events of the fleet and its vehicles; use it in a ``with`` block.
 
@@ -591,11 +561,7 @@ class Fleet(FleetTwin, Selection):
         return Subscription(self._loop, self._loop.call(self.aio.events, *types, capacity=capacity, overflow=overflow))
 
     def states(
-        self,
-        *names: str,
-        every_arrival: bool = False,
-        capacity: int = 10000,
-        overflow: Overflow = "drop_oldest",
+        self, *names: str, every_arrival: bool = False, capacity: int = 10000, overflow: Overflow = "drop_oldest"
     ) -> Subscription[StateUpdate]:
         """Subscribe to states of all members; use it in a ``with`` block.
 

@@ -22,18 +22,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_origin
 
-from aerokit.sync.originals import (
-    TWINS,
-    ClassMember,
-    Twin,
-    decorators_of,
-    function_node,
-    imports_of,
-    members_of,
-)
+from aerokit.sync.originals import TWINS, ClassMember, Twin, decorators_of, function_node, imports_of, members_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
 WIDTH = 120  # the line length of `ruff format`; the output has its style
 
@@ -76,7 +68,7 @@ def render_call(function: str, arguments: Sequence[str], indent: str = "        
     line = f"{function}({', '.join(arguments)})"
     if len(indent) + len(line) < WIDTH:  # One column is left free for a comma.
         return line
-    return f"{function}(\n" + "".join(f"{indent}    {argument},\n" for argument in arguments) + f"{indent})"
+    return f"{function}(\n{_lines(arguments, indent + '    ')}{indent})"
 
 
 def render_function(
@@ -108,7 +100,11 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
     return texts
 
 
-def _lines(arguments: Iterable[str], indent: str) -> str:
+def _lines(arguments: Sequence[str], indent: str) -> str:
+    """Return the arguments on one line if they fit, otherwise on a line each."""
+    line = indent + ", ".join(arguments)
+    if len(line) <= WIDTH:
+        return f"{line}\n"
     lines = ""
     for argument in arguments:
         # Like ruff, break a line that is too long before `| None`.
@@ -296,13 +292,7 @@ class Page:
         return f"{signature}{render_docstring(member.text)}        return {wrapped}\n"
 
 
-TYPE_VARIABLES = {
-    "ItemT": '"Message | Event"',
-    "MessageT": '"Message"',
-    "SetpointT": "",
-    "MeasurementT": "",
-    "T": "",
-}
+TYPE_VARIABLES = {"ItemT": '"Message | Event"', "MessageT": '"Message"', "SetpointT": "", "MeasurementT": "", "T": ""}
 
 
 def generate(name: str = "twins") -> str:
@@ -362,13 +352,11 @@ def _opener(page: Page, path: str) -> str:
     assert isinstance(node.returns, ast.Subscript)
     twin_name = ast.unparse(node.returns.slice)
     parameters = _lines(arguments_of(node.args), "    ")
-    arguments = "".join(f"        {argument.lstrip('*')},\n" for argument in forwarded_arguments(node))
+    arguments = [argument.lstrip("*") for argument in forwarded_arguments(node)]
     _, opener = OPENERS[page.name]
+    call = render_call(opener, [twin_name, f"{name}_async", *arguments], "    ")
     text = (ast.get_docstring(node) or "").replace("``async with``", "``with``")
-    return (
-        f"@checked\ndef {name}(\n{parameters}) -> {twin_name}:\n{render_docstring(text, '    ')}"
-        f"    return {opener}(\n        {twin_name},\n        {name}_async,\n{arguments}    )\n"
-    )
+    return f"@checked\ndef {name}(\n{parameters}) -> {twin_name}:\n{render_docstring(text, '    ')}    return {call}\n"
 
 
 def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
@@ -390,7 +378,8 @@ def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
     if plain_names:
         statement = f"{indent}from {module} import {', '.join(plain_names)}\n"
         if len(statement) > WIDTH + 1:  # `statement` includes the line end, WIDTH does not.
-            statement = f"{indent}from {module} import (\n{_lines(plain_names, indent + '    ')}{indent})\n"
+            lines = "".join(f"{indent}    {name},\n" for name in plain_names)
+            statement = f"{indent}from {module} import (\n{lines}{indent})\n"
         statements[plain_names[0]] = statement
     return "".join(statements[name] for name in sorted(statements, key=_by_kind))
 

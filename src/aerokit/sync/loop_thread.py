@@ -51,10 +51,7 @@ class LoopThread:
         # The caller's context may name another async library, which sniffio would then report in the thread. The thread
         # therefore starts with an empty context.
         self._thread = threading.Thread(
-            target=contextvars.Context().run,
-            args=(_run, self._calls, started),
-            name="aerokit loop",
-            daemon=True,
+            target=contextvars.Context().run, args=(_run, self._calls, started), name="aerokit loop", daemon=True
         )
         self._is_closed = False
         self._finalizer: weakref.finalize[Any, Any] | None = None

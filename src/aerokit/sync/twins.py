@@ -305,11 +305,7 @@ class StateCell(CellTwin[T]):
             ConnectionClosed, LinkLost: the connection ended.
         """
         return self._loop.run(
-            self.aio.wait_until,
-            predicate,
-            held_for=held_for,
-            timeout=timeout,
-            description=description,
+            self.aio.wait_until, predicate, held_for=held_for, timeout=timeout, description=description
         )
 
     def changes(self) -> Changes[T]:
@@ -433,11 +429,7 @@ class Connection(ConnectionTwin):
         self._loop.call(self.aio.discard_unsent)
 
     def subscribe(
-        self,
-        *types: type[ItemT],
-        system_id: int = 0,
-        capacity: int = 1,
-        overflow: Overflow = "drop_oldest",
+        self, *types: type[ItemT], system_id: int = 0, capacity: int = 1, overflow: Overflow = "drop_oldest"
     ) -> Subscription[ItemT]:
         """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
 
@@ -543,11 +535,7 @@ class Guided(TwinOf["AsyncGuided"]):
         return SetpointStream(
             self._loop,
             self._loop.call(
-                self.aio.body_velocity,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
+                self.aio.body_velocity, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s
             ),
         )
 
@@ -563,41 +551,23 @@ class Guided(TwinOf["AsyncGuided"]):
         return SetpointStream(
             self._loop,
             self._loop.call(
-                self.aio.acceleration,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
+                self.aio.acceleration, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s
             ),
         )
 
     def local_position(
-        self,
-        initial: LocalPositionSetpoint,
-        *,
-        rate_hz: float = 10.0,
-        valid_for_s: float = 1.0,
-        max_lag_s: float = 0.5,
+        self, initial: LocalPositionSetpoint, *, rate_hz: float = 10.0, valid_for_s: float = 1.0, max_lag_s: float = 0.5
     ) -> SetpointStream[LocalPositionSetpoint]:
         """Stream positions in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
         return SetpointStream(
             self._loop,
             self._loop.call(
-                self.aio.local_position,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
+                self.aio.local_position, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s
             ),
         )
 
     def position(
-        self,
-        initial: PositionSetpoint,
-        *,
-        rate_hz: float = 10.0,
-        valid_for_s: float = 1.0,
-        max_lag_s: float = 0.5,
+        self, initial: PositionSetpoint, *, rate_hz: float = 10.0, valid_for_s: float = 1.0, max_lag_s: float = 0.5
     ) -> SetpointStream[PositionSetpoint]:
         """Stream global positions (SET_POSITION_TARGET_GLOBAL_INT)."""
         return SetpointStream(
@@ -606,12 +576,7 @@ class Guided(TwinOf["AsyncGuided"]):
         )
 
     def attitude(
-        self,
-        initial: AttitudeSetpoint,
-        *,
-        rate_hz: float = 50.0,
-        valid_for_s: float = 0.3,
-        max_lag_s: float = 0.3,
+        self, initial: AttitudeSetpoint, *, rate_hz: float = 50.0, valid_for_s: float = 0.3, max_lag_s: float = 0.3
     ) -> SetpointStream[AttitudeSetpoint]:
         """Stream attitudes with thrust (SET_ATTITUDE_TARGET)."""
         return SetpointStream(
@@ -636,41 +601,23 @@ class Guided(TwinOf["AsyncGuided"]):
         return SetpointStream(
             self._loop,
             self._loop.call(
-                self.aio.attitude_rate,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
+                self.aio.attitude_rate, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s
             ),
         )
 
     def trajectory(
-        self,
-        initial: TrajectorySetpoint,
-        *,
-        rate_hz: float = 50.0,
-        valid_for_s: float = 0.5,
-        max_lag_s: float = 0.5,
+        self, initial: TrajectorySetpoint, *, rate_hz: float = 50.0, valid_for_s: float = 0.5, max_lag_s: float = 0.5
     ) -> SetpointStream[TrajectorySetpoint]:
         """Stream local positions with velocity and acceleration feed-forward (SET_POSITION_TARGET_LOCAL_NED)."""
         return SetpointStream(
             self._loop,
             self._loop.call(
-                self.aio.trajectory,
-                initial,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
+                self.aio.trajectory, initial, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s
             ),
         )
 
     def actuators(
-        self,
-        initial: ActuatorSetpoint,
-        *,
-        rate_hz: float = 100.0,
-        valid_for_s: float = 0.1,
-        max_lag_s: float = 0.1,
+        self, initial: ActuatorSetpoint, *, rate_hz: float = 100.0, valid_for_s: float = 0.1, max_lag_s: float = 0.1
     ) -> SetpointStream[ActuatorSetpoint]:
         """Stream actuator controls (SET_ACTUATOR_CONTROL_TARGET).
 
@@ -839,8 +786,7 @@ class External(TwinOf["AsyncExternal"]):
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
         """Supply pose and velocity (ODOMETRY). Needs VISO_TYPE 1 to 3 on ArduPilot, EKF2_EV_CTRL above 0 on PX4."""
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.odometry, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.odometry, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def vision_position(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
@@ -849,22 +795,19 @@ class External(TwinOf["AsyncExternal"]):
         Needs VISO_TYPE 1 to 3 on ArduPilot, EKF2_EV_CTRL above 0 on PX4.
         """
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.vision_position, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.vision_position, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def vision_speed(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[SpeedMeasurement]:
         """Supply a velocity (VISION_SPEED_ESTIMATE; for PX4 ODOMETRY without a pose)."""
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.vision_speed, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.vision_speed, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def motion_capture(self, *, rate_hz: float = 50.0, valid_for_s: float = 0.2) -> MeasurementStream[PoseMeasurement]:
         """Supply a pose from motion capture (ATT_POS_MOCAP; for PX4 VISION_POSITION_ESTIMATE)."""
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.motion_capture, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.motion_capture, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def gps(self, *, rate_hz: float = 5.0, valid_for_s: float = 0.5) -> MeasurementStream[GpsMeasurement]:
@@ -877,15 +820,13 @@ class External(TwinOf["AsyncExternal"]):
         Set PRX1_TYPE to 2 on ArduPilot, CP_DIST above 0 on PX4.
         """
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.obstacles, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.obstacles, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def obstacle_points(self, *, rate_hz: float = 10.0, valid_for_s: float = 0.5) -> MeasurementStream[ObstaclePoints]:
         """Supply positions of obstacles (OBSTACLE_DISTANCE_3D). Only ArduPilot reads them: set PRX1_TYPE to 2."""
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.obstacle_points, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def range_finder(self, *, rate_hz: float = 20.0, valid_for_s: float = 0.2) -> MeasurementStream[RangeMeasurement]:
@@ -894,23 +835,18 @@ class External(TwinOf["AsyncExternal"]):
         On ArduPilot, set RNGFND1_TYPE to 10, and RNGFND1_ORIENT to the direction of the sensor.
         """
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.range_finder, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def landing_target(
-        self,
-        *,
-        rate_hz: float = 20.0,
-        valid_for_s: float = 0.3,
+        self, *, rate_hz: float = 20.0, valid_for_s: float = 0.3
     ) -> MeasurementStream[TargetMeasurement]:
         """Supply the position of a landing target (LANDING_TARGET). On ArduPilot, set PLND_ENABLED and PLND_TYPE to 1.
 
         ``vehicle.land_on`` opens this stream itself and lands the vehicle.
         """
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.landing_target, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.landing_target, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
@@ -919,8 +855,7 @@ class External(TwinOf["AsyncExternal"]):
         On ArduPilot, set FLOW_TYPE to 5. On PX4, set EKF2_OF_CTRL to 1.
         """
         return MeasurementStream(
-            self._loop,
-            self._loop.call(self.aio.optical_flow, rate_hz=rate_hz, valid_for_s=valid_for_s),
+            self._loop, self._loop.call(self.aio.optical_flow, rate_hz=rate_hz, valid_for_s=valid_for_s)
         )
 
     def set_wind(
@@ -1098,12 +1033,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         return self._loop.call(lambda: self.aio.device_id)
 
     def look_at(
-        self,
-        target: Position | Home,
-        *,
-        wait: bool = True,
-        tolerance_deg: float = 5.0,
-        timeout: float = 15.0,
+        self, target: Position | Home, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
     ) -> None:
         """Keep the gimbal pointed at a position; returns when it points there.
 
@@ -1126,12 +1056,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.look_at, target, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
 
     def look_at_system(
-        self,
-        system_id: int,
-        *,
-        wait: bool = True,
-        tolerance_deg: float = 5.0,
-        timeout: float = 15.0,
+        self, system_id: int, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
     ) -> None:
         """Keep the gimbal pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
 
@@ -1462,11 +1387,7 @@ class Files(TwinOf["AsyncFiles"]):
             RemoteProtocolError: the vehicle's answers are invalid, or its file became shorter during the read.
         """
         return self._loop.run(
-            self.aio.read,
-            path,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.read, path, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def download(
@@ -1501,11 +1422,7 @@ class Files(TwinOf["AsyncFiles"]):
         )
 
     def list(
-        self,
-        path: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
+        self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> tuple[FileEntry, ...]:
         """List a directory, without ``.`` and ``..``, in the vehicle's order.
 
@@ -1580,12 +1497,7 @@ class Files(TwinOf["AsyncFiles"]):
         )
 
     def truncate(
-        self,
-        path: str,
-        size: int,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
+        self, path: str, size: int, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> None:
         """Cut a file to ``size`` bytes, or extend it with zeros. Supported by PX4, not by ArduPilot."""
         self._loop.run(self.aio.truncate, path, size, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1595,32 +1507,19 @@ class Files(TwinOf["AsyncFiles"]):
         self._loop.run(self.aio.remove, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def remove_directory(
-        self,
-        path: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
+        self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> None:
         """Remove an empty directory; on ArduPilot also a file."""
         self._loop.run(self.aio.remove_directory, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def make_directory(
-        self,
-        path: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
+        self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> None:
         """Create a directory; its parent must exist."""
         self._loop.run(self.aio.make_directory, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def rename(
-        self,
-        path: str,
-        new_path: str,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
+        self, path: str, new_path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> None:
         """Rename or move a file or directory; both paths together must fit into one message."""
         self._loop.run(self.aio.rename, path, new_path, idle_timeout_s=idle_timeout_s, timeout=timeout)
@@ -1725,12 +1624,7 @@ class Logs(TwinOf["AsyncLogs"]):
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
         """
         return self._loop.run(
-            self.aio.read,
-            log,
-            method=method,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.read, log, method=method, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
@@ -1908,11 +1802,7 @@ class Actuators(TwinOf["AsyncActuators"]):
             OperationTimeout: the vehicle still reports armed four seconds after the end of the test.
         """
         self._loop.run(
-            self.aio.test_motor,
-            number,
-            throttle_percent=throttle_percent,
-            duration_s=duration_s,
-            intent=intent,
+            self.aio.test_motor, number, throttle_percent=throttle_percent, duration_s=duration_s, intent=intent
         )
 
     def release_parachute(self, *, intent: ReleaseIntent) -> None:
@@ -2272,10 +2162,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         return self._loop.run(self.aio.read, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def probe(
-        self,
-        *names: str,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
+        self, *names: str, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> dict[str, Parameter | ParameterRejected | ParameterTimeout]:
         """Request several parameters that the vehicle may not have, by exactly these names.
 
@@ -2291,12 +2178,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         return self._loop.run(self.aio.probe, *names, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def set(
-        self,
-        name: str,
-        value: float,
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        timeout: float | None = None,
+        self, name: str, value: float, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> ParameterWrite:
         """Set one parameter; return the result as confirmed by the vehicle.
 
@@ -2323,11 +2205,7 @@ class Parameters(TwinOf["AsyncParameters"]):
             InvalidArgument: a name or value is invalid. Nothing was set.
         """
         return self._loop.run(
-            self.aio.set_many,
-            values,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.set_many, values, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def upload(
@@ -2366,10 +2244,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         )
 
     def temporarily(
-        self,
-        values: Mapping[str, float],
-        *,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        self, values: Mapping[str, float], *, idle_timeout_s: float = IDLE_TIMEOUT_S
     ) -> TemporaryParameters:
         """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
@@ -2384,8 +2259,7 @@ class Parameters(TwinOf["AsyncParameters"]):
             RollbackFailed: some values could not be restored; ``not_restored`` has them.
         """
         return TemporaryParameters(
-            self._loop,
-            self._loop.call(self.aio.temporarily, values, idle_timeout_s=idle_timeout_s),
+            self._loop, self._loop.call(self.aio.temporarily, values, idle_timeout_s=idle_timeout_s)
         )
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
@@ -2412,11 +2286,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         ``before`` is None for a name that the vehicle does not have. Names and units in the result are the vehicle's.
         """
         return self._loop.run(
-            self.aio.diff,
-            parameters,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.diff, parameters, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def changed_from_default(
@@ -2432,10 +2302,7 @@ class Parameters(TwinOf["AsyncParameters"]):
             NotSupported: the defaults are unknown, because neither MAVFTP nor metadata with defaults is available.
         """
         return self._loop.run(
-            self.aio.changed_from_default,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.changed_from_default, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
 
@@ -2617,11 +2484,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
-            self.aio.download,
-            method=method,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.download, method=method, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
@@ -2829,11 +2692,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
-            self.aio.download,
-            method=method,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.download, method=method, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
@@ -2938,11 +2797,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
-            self.aio.download,
-            method=method,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.download, method=method, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
@@ -3035,8 +2890,7 @@ class Rtk(TwinOf["AsyncRtk"]):
             InvalidArgument: the URL is invalid. Nothing was opened.
         """
         return NtripClient(
-            self._loop,
-            self._loop.call(self.aio.ntrip, url, send_position=send_position, timeout=timeout),
+            self._loop, self._loop.call(self.aio.ntrip, url, send_position=send_position, timeout=timeout)
         )
 
 
@@ -3521,10 +3375,7 @@ class Settings(TwinOf["AsyncSettings"]):
         return self.aio.definition
 
     def load(
-        self,
-        definition: CameraDefinition | str | os.PathLike[str],
-        *,
-        locale: str | None = None,
+        self, definition: CameraDefinition | str | os.PathLike[str], *, locale: str | None = None
     ) -> CameraDefinition:
         """Set the camera definition that describes the settings.
 
@@ -3565,11 +3416,7 @@ class Settings(TwinOf["AsyncSettings"]):
             OperationRejected: the web server failed.
         """
         return self._loop.run(
-            self.aio.fetch_definition,
-            uri,
-            locale=locale,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
+            self.aio.fetch_definition, uri, locale=locale, idle_timeout_s=idle_timeout_s, timeout=timeout
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
@@ -3600,11 +3447,7 @@ class Settings(TwinOf["AsyncSettings"]):
                 settings that arrived.
         """
         return self._loop.run(
-            self.aio.download,
-            refresh=refresh,
-            idle_timeout_s=idle_timeout_s,
-            timeout=timeout,
-            on_progress=on_progress,
+            self.aio.download, refresh=refresh, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
         )
 
     def get(self, name: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> SettingValue:
@@ -3759,11 +3602,7 @@ class Component(TwinOf["AsyncComponent"]):
         return self._loop.run(self.aio.request, message_type, *params, timeout=timeout, where=where)
 
     def subscribe(
-        self,
-        *types: type[ItemT],
-        capacity: int = 1,
-        overflow: Overflow = "drop_oldest",
-        rate_hz: float | None = None,
+        self, *types: type[ItemT], capacity: int = 1, overflow: Overflow = "drop_oldest", rate_hz: float | None = None
     ) -> Subscription[ItemT]:
         """Subscribe to messages of this component, requested at ``rate_hz``, and to events about it.
 
@@ -4235,10 +4074,7 @@ class Vehicle(VehicleTwin):
         self._loop.call(self.aio.note_sent, message)
 
     def posted(
-        self,
-        *subjects: Subject,
-        modes: tuple[Mode, ...] = (),
-        armed: bool | None = None,
+        self, *subjects: Subject, modes: tuple[Mode, ...] = (), armed: bool | None = None
     ) -> AbstractContextManager[PostedOrder]:
         """Open an order without waiting for its effect, so that orders for mode, arming and take-off can overlap.
 
@@ -4266,11 +4102,7 @@ class Vehicle(VehicleTwin):
         return self._twin_block(PostedOrder, self.aio.posted(*subjects, modes=modes, armed=armed))
 
     def subscribe(
-        self,
-        *types: type[ItemT],
-        capacity: int = 1,
-        overflow: Overflow = "drop_oldest",
-        rate_hz: float | None = None,
+        self, *types: type[ItemT], capacity: int = 1, overflow: Overflow = "drop_oldest", rate_hz: float | None = None
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
@@ -4569,20 +4401,11 @@ class Vehicle(VehicleTwin):
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
         self._loop.run(
-            self.aio.arm,
-            mode=mode,
-            force=force,
-            reason=reason,
-            timeout=timeout,
-            max_silence_s=max_silence_s,
+            self.aio.arm, mode=mode, force=force, reason=reason, timeout=timeout, max_silence_s=max_silence_s
         )
 
     def disarm(
-        self,
-        *,
-        force: bool = False,
-        timeout: float = 10.0,
-        max_silence_s: float | None = MAX_SILENCE_S,
+        self, *, force: bool = False, timeout: float = 10.0, max_silence_s: float | None = MAX_SILENCE_S
     ) -> None:
         """Stop the motors and wait until HEARTBEAT reports disarmed.
 
@@ -5040,11 +4863,7 @@ class Vehicle(VehicleTwin):
         return self.aio.distance_to(target)
 
     def take_off(
-        self,
-        altitude_m: float,
-        *,
-        timeout: float = 60.0,
-        max_silence_s: float | None = MAX_SILENCE_S,
+        self, altitude_m: float, *, timeout: float = 60.0, max_silence_s: float | None = MAX_SILENCE_S
     ) -> None:
         """Take off and climb to ``altitude_m`` above home. Returns when the vehicle is at that altitude.
 
@@ -5173,12 +4992,7 @@ class Vehicle(VehicleTwin):
         return StickStream(
             self._loop,
             self._loop.call(
-                self.aio.sticks,
-                initial,
-                mode=mode,
-                rate_hz=rate_hz,
-                valid_for_s=valid_for_s,
-                max_lag_s=max_lag_s,
+                self.aio.sticks, initial, mode=mode, rate_hz=rate_hz, valid_for_s=valid_for_s, max_lag_s=max_lag_s
             ),
         )
 
