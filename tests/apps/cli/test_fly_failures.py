@@ -511,5 +511,4 @@ def test_only_new_positions_near_ground_show_stillness(age_s: float, height_m: f
     )
     stillness = _StillnessNearGround(vehicle, 20.0)
     now[0] = 120.0
-    stillness.update()
-    assert stillness.has_lasted is has_lasted
+    assert stillness.has_lasted() is has_lasted

@@ -64,8 +64,7 @@ async def record_to_end(
 
     async def wait() -> int:
         while vehicle.is_armed and vehicle.connection.is_open and vehicle.heartbeat_age < MAX_SILENCE_S:
-            stillness.update()
-            if stillness.has_lasted:
+            if stillness.has_lasted():
                 break
             await anyio.sleep(_POLL_INTERVAL_S)
         return DONE  # `interrupts.run` returns None only after an interrupt
@@ -82,15 +81,13 @@ class _StillnessNearGround:
         self._min_duration_s = min_duration_s
         self._still_at = vehicle.position.latest
         self._still_since = vehicle.connection.now()
-        self.has_lasted: bool = False
-        """True if the vehicle had been still for the whole time at the last `update`."""
 
-    def update(self) -> None:
-        """Update ``has_lasted`` from the vehicle's latest position. Call this regularly."""
+    def has_lasted(self) -> bool:
+        """Consider the vehicle's latest position. Call this regularly."""
         now = self._vehicle.connection.now()
         position = self._vehicle.position.latest
         if position is None:
-            return
+            return False
         is_old = self._vehicle.position.age > SILENT_AFTER_S
         has_moved = self._still_at is None or position.distance_to(self._still_at) > _MAX_DRIFT_M
         height_m = position.altitude_relative_m
@@ -99,4 +96,4 @@ class _StillnessNearGround:
         if is_old or has_moved or not is_near_ground:
             self._still_at = position
             self._still_since = now
-        self.has_lasted = now - self._still_since >= self._min_duration_s
+        return now - self._still_since >= self._min_duration_s
