@@ -33,7 +33,7 @@ ClassT = TypeVar("ClassT")
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
-# Rules by the name of the annotation.
+# Maps an annotation to the check of its values, and to the description of valid values.
 _SIMPLE: dict[str, Rule] = {
     "float": (lambda value: isinstance(value, Real), "a number"),
     "int": (lambda value: isinstance(value, Integral), "a whole number"),
@@ -59,7 +59,7 @@ def _is_above_zero(value: Any) -> bool:
         return False
 
 
-# Rules for parameters that denote a time, by their annotation.
+# Like `_SIMPLE`, but for parameters that denote a time.
 _SECONDS: dict[str, Rule] = {
     "float": (_is_above_zero, "a number of seconds above 0"),
     "float | None": (lambda value: value is None or _is_above_zero(value), "a number of seconds above 0, or None"),

@@ -71,7 +71,7 @@ def _fields(value: object) -> Mapping[str, object] | None:
 
 def printable(text: str) -> str:
     """Replace unprintable characters. Newlines are kept."""
-    # A terminal might interpret such characters in a text from a vehicle.
+    # A text from a vehicle may contain control characters, which a terminal would interpret.
     return "".join(char if char.isprintable() or char == "\n" else "\N{REPLACEMENT CHARACTER}" for char in text)
 
 

@@ -60,7 +60,7 @@ class _SnapshotType(type):
 def _lazy_init(cls: Any) -> Callable[..., None]:
     """Return an ``__init__`` that replaces itself by a generated one when it is first called."""
 
-    # A program creates values of only a few of these classes, and generating takes time.
+    # Generating the method takes time, and a program creates values of only a few of these classes.
     def generate_and_call(self: object, *args: Any, **kwargs: Any) -> None:
         init = _generate_init(cls)
         type.__setattr__(cls, "__init__", init)
@@ -73,7 +73,7 @@ def _lazy_init(cls: Any) -> Callable[..., None]:
 def _generate_init(cls: Any) -> Any:
     """Generate ``def __init__(self, a, b=default)``."""
     fields, defaults = cls.__match_args__, cls._defaults
-    # The slots are set directly, because `__setattr__` refuses it.
+    # The generated method sets the slots directly, because `__setattr__` of an immutable class raises.
     scope: dict[str, Any] = {f"_set_{field}": getattr(cls, field).__set__ for field in fields}
     scope.update({f"_default_{field}": value for field, value in defaults.items()})
     arguments = [f"{field}=_default_{field}" if field in defaults else field for field in fields]

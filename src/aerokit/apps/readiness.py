@@ -96,7 +96,7 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     needed = []
     for text in missing:
         is_missing_position = text.startswith(("the estimator has no ", "no GPS receiver has "))
-        # If a report was not received, the vehicle may nevertheless have the estimate.
+        # A report that was not received does not count, because the vehicle may have the estimate.
         is_missing_report = text.startswith(("estimator (", "position (", "home (")) and text.endswith(" not received)")
         if (needs_position or not is_missing_position) and not is_missing_report:
             needed.append(text)
@@ -127,7 +127,7 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     if estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which arming would change the mode"
         headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
-        # The vehicle may have a value that was not received, so such a value is not named as a reason.
+        # A value that was not received is not named as a reason, because the vehicle itself may have it.
         return [headline, *(text for text in missing if not text.endswith(" not received)"))]
     return []
 

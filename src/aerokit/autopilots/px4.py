@@ -101,7 +101,7 @@ class Px4(Autopilot):
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
     external: ExternalRules = PX4_EXTERNAL
-    actuators_until: tuple[int, int] | None = (1, 14)  # Commit 27658354 removed SET_ACTUATOR_CONTROL_TARGET.
+    actuators_until: tuple[int, int] | None = (1, 14)  # PX4's commit 27658354 removed SET_ACTUATOR_CONTROL_TARGET.
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(
         has_secondary=False,
@@ -141,7 +141,7 @@ class Px4(Autopilot):
     unselectable_modes: frozenset[str] = frozenset(
         ("ORBIT", "RATTITUDE", "READY", "RTGS", "SIMPLE", "TERMINATION", "VTOL_TAKEOFF")
     ).union(f"EXTERNAL{number}" for number in range(1, 9))
-    # mode_requirements.cpp, and OFFBOARD, because it needs a stream of set-points.
+    # Modes in which PX4 does not arm (mode_requirements.cpp), and OFFBOARD, which needs a stream of set-points.
     unarmable_modes: frozenset[str] = frozenset(
         ("FOLLOWME", "LAND", "OFFBOARD", "ORBIT", "PRECLAND", "RTL", "TERMINATION")
     )

@@ -163,7 +163,7 @@ class FleetAction:
             await tasks.aclose()
         if self.program_error is not None:
             self._hold_finished_members()
-            await asyncio.sleep(0)  # The orders are sent before the error may end the fleet's block.
+            await asyncio.sleep(0)  # The commands to hold must be sent before the error can end the fleet.
             raise self.program_error
         return self.result_so_far()
 
@@ -246,7 +246,7 @@ class FleetAction:
                 f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
             )
         self._last_start_at = self._context.now()
-        # An action that starts this member later must not treat this action's order as newer.
+        # Actions that still wait to start this member would otherwise treat this action's order as a newer one.
         for action in self._context.actions:
             action._orders_before.pop(member.name, None)
         if not member.is_available:
@@ -275,7 +275,7 @@ class FleetAction:
 
     def _has_newer_order(self, member: Member) -> bool:
         """Return True if a newer action moves the member, or the program has told it to land or return."""
-        # While a function of the program runs as this action, it may itself have ordered the landing.
+        # If the action is a function of the program, this function may itself have ordered the landing.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
         return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
 
@@ -328,7 +328,7 @@ class FleetAction:
         if len(self._undecided) > 1:
             return
         while self._undecided:
-            if self._policy_cause is None:  # The policy has not given orders in this action yet.
+            if self._policy_cause is None:  # The failure policy gives orders only once in an action.
                 self._apply_policy(self._undecided[0])
             del self._undecided[0]
 
@@ -461,7 +461,7 @@ def _newest_order(member: Member) -> Order | None:
 def _is_ending_flight(member: Member) -> bool:
     """Return True while an order of this program to land or return is valid."""
     newest = _newest_order(member)
-    # A posted order that was closed still flies the vehicle.
+    # It does not matter whether the block that gave the order has ended: the vehicle still executes the order.
     return newest is not None and newest.ends_flight and newest.is_newest and not newest.takeover_reason
 
 
@@ -499,7 +499,7 @@ class FleetContext:
         self.is_closed = True
         for member in self.members.values():
             member.stop_monitoring()
-        for action in tuple(self.actions):  # Otherwise actions continue with vehicles that stay connected.
+        for action in tuple(self.actions):  # The vehicles may stay connected, so the actions would continue.
             action.close()
         await self.background.aclose()
 
@@ -508,7 +508,7 @@ class FleetContext:
 
     def newest_orders(self, member: Member) -> tuple[object, object]:
         """Return a value that changes whenever the program orders the member to move."""
-        # An action that moves the member counts before it gives an order.
+        # The start of an action that moves the member counts, too, because the action's order follows later.
         return _newest_order(member), self.newest_moves.get(member.name)
 
     def hold(self, member: Member, task_name: str) -> None:

@@ -260,7 +260,7 @@ class _Discovery:
         for name in self._searched:
             connection = self._networks[name]
             connection.raise_if_ended()
-            # Not the events VehicleFound, because a vehicle that returns is not found again.
+            # A vehicle that returns after a silence sends a HEARTBEAT, but causes no second event VehicleFound.
             stack.callback(connection.bus.attach(Heartbeat, partial(self._on_heartbeat, name)))
             stack.callback(connection.on_end(lambda _: self._changed.set()))
             for source, heartbeat in connection.heartbeats.items():
@@ -371,7 +371,7 @@ class MemberConnections:
     ) -> None:
         self._has_block_failed = error is not None
         self._close.set()
-        # If a task is still connecting, opening has failed, and cancelling all tasks is enough.
+        # While a task is still connecting, opening has failed: cancelling the tasks, without this wait, is enough.
         are_all_connected = len(self._connected) == self._running_task_count
         if self._running_task_count and are_all_connected:
             await run_shielded(self._all_closed.wait())

@@ -127,7 +127,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
 
 # ------------------------------------------------------------------------------------------ report
 
-# The lag is computed from faster legs only. On slower legs, a lag cannot be distinguished from a position error.
+# A member's lag behind its track is computed from faster legs only. On slower legs, it looks like a position error.
 MIN_LAG_SPEED_M_S = 0.3
 
 RELATIVE_ERROR_SAMPLES = 60
@@ -412,7 +412,7 @@ class Shows(Travel):
         conflicts = [
             conflict
             for conflict in find_conflicts(paths, min_m, slack_s=CONFLICT_SLACK_S)
-            if conflict.name not in stationary  # Otherwise both members stay where they are.
+            if conflict.name not in stationary  # Two members that stay where they are need no check.
         ]
         if conflicts:
             conflict = conflicts[0]
@@ -454,7 +454,7 @@ async def _fly_track(
             # A late member would fly to its track on a way that was not compared with the other tracks.
             if late_s > max_late_s:
                 raise OperationRejected(f"show: {member.name} would join its track {late_s:.1f} s late, so it holds")
-            # From here on, the stream itself stops if the event loop is blocked.
+            # Later delays are not checked here: if the event loop is blocked, the stream stops by itself.
             while (at_s := vehicle.connection.now() - begin_at) < path.ends_at_s:
                 # Before the start, a member waits for its first position. Later, a missing position is an error.
                 if at_s < 0 and not recorder.has_position:

@@ -355,7 +355,7 @@ class Missions(SelectionBase):
         async def upload(member: Member) -> None:
             async with slots[member.network]:
                 newest = self._context.newest_upload
-                if newest is not missions and member.name in newest:  # This transfer may replace the newer mission.
+                if newest is not missions and member.name in newest:  # This may replace the newer upload's mission.
                     self._context.newest_upload = {}
                     self._context.missions.clear()
                 await member.vehicle.mission.upload(
@@ -364,7 +364,7 @@ class Missions(SelectionBase):
 
         result = await self._run("upload", upload, names=tuple(missions))
         result.raise_for_errors()
-        # If a newer upload has begun, its missions were not compared with these.
+        # If a newer upload has begun, only its missions count: they were not compared with the missions of this one.
         if self._context.newest_upload is missions:
             self._context.missions.update(missions)
         return result

@@ -225,7 +225,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
             if first is None:
                 merged[enum.name] = enum
                 continue
-            # Everything but the entries is from the first file. Of entries with the same name, the last one is used.
+            # Only entries are merged: all else is from the first file's enum. For each name, the last entry is used.
             entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
             ordered = sorted(entries.values(), key=lambda entry: entry.value)
             merged[enum.name] = replace(first, entries=tuple(ordered))

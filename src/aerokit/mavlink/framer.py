@@ -171,7 +171,7 @@ class PythonFramer:
                 body = b""
                 end = sequence = key = message_id = checksum = 0
             if not is_valid:
-                # Kept data was examined before, so `_search` continues with the findings in `scan`.
+                # Data that was kept from earlier calls is not examined again: `scan` has the findings for `_search`.
                 next_frame = None
                 if data[begin] in _MAGICS and (begin or scan is _NEW_SCAN):
                     _, _, next_frame = self._examine(data, begin)
@@ -233,7 +233,7 @@ class PythonFramer:
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
-                # Unwanted frames are not in `frames`, so another frame may be at this position.
+                # `frames` has only the wanted messages, so the frame at `position` may be a different one.
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
                     continue
                 if ordering == OTHERS:

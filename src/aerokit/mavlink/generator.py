@@ -88,7 +88,7 @@ def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tup
     for field in added.fields:
         existing_field = fields.get(field.name)
         if existing_field is not None:
-            # The addition replaces the units, enum and invalid value, even by empty ones.
+            # The added field replaces the units, enum and invalid value, even by empty ones.
             field = replace(existing_field, units=field.units, enum=field.enum, invalid=field.invalid)
         fields[field.name] = field
     return tuple(fields.values())
@@ -99,7 +99,7 @@ def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[En
     merged = {entry.name: _merged_entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
         merged.setdefault(name, entry)
-    # Sorting is stable, so of several names for one value, the added names stay first.
+    # Sorting is stable: if several names have the same value, the added names stay first.
     return tuple(sorted(merged.values(), key=lambda entry: entry.value))
 
 
@@ -122,8 +122,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "development": ("development",),
 }
 
-# These messages of ``common.xml``, which most flights use, are in ``common.py``. The other two hundred are in
-# ``common_more.py``. A program that needs none of these does not import this module, because its import is slow.
+# The messages of ``common.xml`` that most flights use. They are in ``common.py``, the other two hundred in
+# ``common_more.py``. A program that uses none of the two hundred does not import ``common_more``, which is slow.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt
@@ -352,7 +352,7 @@ def _other_files(stems: Sequence[str]) -> str:
 def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
-    stems = MODULES.get(module, MODULES["common"])  # COMMON_MORE has messages of the same files as common.
+    stems = MODULES.get(module, MODULES["common"])  # common_more.py has messages of the same XML files as common.py.
     head = _MESSAGES_HEAD.format(name=stems[0], more=_other_files(stems), helpers=helpers)
     if "Sequence[" not in text:
         head = head.replace("    from collections.abc import Sequence\n\n", "")

@@ -321,7 +321,6 @@ def _number_problem(value: Any, kind: str) -> str | None:
                 return f"must be an integer in {low}..{high} ({kind})"
         return None if low <= value.__index__() <= high else f"must be in {low}..{high} ({kind})"
     try:
-        # A number is what ``struct`` accepts.
         struct.pack("<f" if kind == "float" else "<d", value)
     except OverflowError:
         return f"does not fit into a {kind}"

@@ -64,9 +64,8 @@ class MessageFactory(_MAVLink):
 
 
 def _accept_text(encode: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap an ``…_encode`` method of pymavlink, so that it accepts `str` for text fields."""
+    """Wrap an ``…_encode`` method of pymavlink, which accepts only bytes, so that it accepts `str` for text fields."""
 
-    # pymavlink accepts only bytes.
     @wraps(encode)
     def encode_text(self: MessageFactory, *args: Any, **kwargs: Any) -> Any:
         converted_args = [_as_bytes(value) for value in args]

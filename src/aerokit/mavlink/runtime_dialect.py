@@ -71,9 +71,8 @@ def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message
 
 
 def compile_message(definition: MessageDefinition) -> type[Message]:
-    """Create a class like the generated ones. Its messages cannot be pickled."""
+    """Create a class like the generated ones. Its messages cannot be pickled, because no module contains the class."""
     source = "from __future__ import annotations\n" + render_message(definition, docs=False)
-    # No module has the class, so pickle cannot find it.
     namespace: dict[str, Any] = {
         "__name__": f"{__name__}.{definition.origin}",
         "Struct": Struct,

@@ -165,8 +165,8 @@ class SourceStatistics(SourceFields):
         is_direct_succession = follows and self._received_at_repetition == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        # A link may repeat two or three recent frames, so four are required. Links hardly ever repeat older frames, so
-        # two are enough.
+        # Links may repeat two or three recent frames, so only four in a row show a reboot. Links hardly ever repeat
+        # older frames, so two are enough.
         min_run = 3 if is_near else 1
         if self._late_run >= min_run:
             self._begin_stream(now)
@@ -185,7 +185,7 @@ class SourceStatistics(SourceFields):
 
     def _continue_at(self, sequence: int) -> None:
         """Make this sequence number the newest."""
-        # The numbers before it do not count as lost.
+        # The skipped sequence numbers do not count as lost.
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
         self._missing_base = self.expected
@@ -202,7 +202,7 @@ class SourceStatistics(SourceFields):
         # If the current stream has timed out, the other stream replaces it at once. Otherwise, only a longer stream
         # replaces it, after `_MIN_RETURNS` frames.
         if is_over or self._returns >= _MIN_RETURNS:
-            # The frames of a shorter stream are counted from 0 again.
+            # If the other stream is shorter, its frames are counted from 0 again.
             other_count = self._other_count if is_other_longer else 0
             self._swap(sequence, now, current_count, other_count)
             return IN_ORDER
@@ -219,8 +219,8 @@ class SourceStatistics(SourceFields):
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
-        # No frames were lost between the two streams. If some of these sequence numbers have arrived late, they are
-        # already subtracted, so the difference may be negative.
+        # The numbers between the two streams were not lost, so they are subtracted. Some of them may have arrived late
+        # and been subtracted before, so the difference may be negative.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
         self._other_count = current_count

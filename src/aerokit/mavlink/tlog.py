@@ -101,7 +101,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
     """Return True if a record probably begins between ``begin`` and ``end``, instead of at ``begin``."""
     for inside in range(begin + 1, end):
         inside_end = _frame_end(data, inside)
-        # The record that begins inside ends later, and a further record follows it.
+        # A record begins at `inside`, ends after `end`, and is followed by another record.
         if inside_end is not None and inside_end > end and _frame_end(data, inside_end) is not None:
             return True
     return False

@@ -233,7 +233,7 @@ class CommandExchange(Exchange[CommandAck]):
             attempts = allowed_attempts(message.command, _params_of(message))
             is_unrepeatable = attempts == 1
         if attempt_timeout is None:
-            # A command that must not be repeated gets the time of four attempts.
+            # A command that must not be repeated waits as long as all attempts of another command.
             attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
         if attempt_timeout > 0:  # Other values are refused below, and the error must show them unchanged.
             attempt_timeout = max(attempt_timeout, min_timeout_s)

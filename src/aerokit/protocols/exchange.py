@@ -350,8 +350,7 @@ class StaleAnswerFilter:
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):
             return False
         if attempts == 1:
-            # The sample shortens the round trip, so that the next answer is accepted if the vehicle really is this
-            # fast.
+            # This sample lowers `fastest_s`. If the vehicle really is this fast, its next answer is then accepted.
             self._round_trip.add_sample(elapsed_s)
         early_requests = self._early_requests.setdefault(name, set())
         early_requests.add(sent_at)

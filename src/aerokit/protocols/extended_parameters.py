@@ -165,7 +165,7 @@ class SettingReads(NamedReads[Setting]):
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
             self._count_probe()
             self._window.on_answer(PROBE, now)
-            # The component answers requests, so other names without an answer may be unknown to it.
+            # The answered probe shows that the component answers, so it may not know the names without an answer.
             unanswered = [other for other in self._names if other not in self._results and other != name]
             self._reject_if_requested_often(unanswered, now)
         if name and name in self._window:

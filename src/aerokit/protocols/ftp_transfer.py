@@ -165,7 +165,7 @@ class FtpDownload(FtpExchange[int]):
                 if burst.contains(reply):
                     self._on_block(burst, reply, now)
                     return
-            # A NAK with any error belongs to a burst if the file may end at its offset.
+            # A NAK, whatever its error, belongs to a burst if the file may end at the offset of the NAK.
             elif (end := burst.file_end(reply)) is not None:
                 self._end_burst(burst, end, reply)
                 return
@@ -238,7 +238,7 @@ class FtpDownload(FtpExchange[int]):
         self._requests.discard_from(end)
 
     def _is_plausible(self, offset: int) -> bool:
-        # A block far beyond all others would add millions of missing blocks.
+        # After a block far beyond all others, millions of blocks would count as missing.
         return not self._is_past_size(offset) and offset - self._reassembly.tail < MAX_BLOCK_DISTANCE
 
     def _is_past_size(self, offset: int) -> bool:

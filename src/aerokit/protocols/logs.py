@@ -42,7 +42,7 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# Ranges grow until one takes this many time-outs. The pause between two ranges is then negligible.
+# Ranges grow until one lasts this many time-outs, so that the pause between two ranges is negligible.
 MIN_RANGE_TIMEOUTS = 60
 
 MAX_EARLY_ENDS = 3
@@ -120,7 +120,7 @@ class LogDownload(Transfer[int]):
         self._proceed(now)
 
     def _is_plausible(self, offset: int) -> bool:
-        # A block far beyond the data received so far would add millions of missing blocks.
+        # After a block far beyond the data received so far, millions of blocks would count as missing.
         return offset < self._size and offset - self._reassembly.tail < MAX_RANGE * LOG_BLOCK
 
     def _on_block(self, message: LogData, now: float) -> None:
@@ -143,7 +143,7 @@ class LogDownload(Transfer[int]):
         self._requests.on_answer(offset, now)
 
     def _on_short_block(self, end: int) -> None:
-        # The vehicle could not read its own log. This may be temporary, so the data is requested again a few times.
+        # The vehicle could not read its own log here. It may succeed later, so the data is requested a few more times.
         self._is_streaming = False
         self._early_ends += 1
         if self._early_ends >= MAX_EARLY_ENDS:
@@ -201,7 +201,7 @@ class LogDownload(Transfer[int]):
         self._request(start, self._range_end - start)
 
     def _adapt_range(self) -> None:
-        # After a time-out, the range proves nothing, because the request or the link may have failed.
+        # After a time-out, missing blocks do not show that the range was too long: the link may have failed.
         if self._stream.failures or not self._requested_blocks:
             return
         # Radios lose up to a third of the messages. If more than half are lost, a queue overflows.

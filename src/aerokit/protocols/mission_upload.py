@@ -303,8 +303,8 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
         """Repeat the unconfirmed items, and send up to ``ahead`` further items."""
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # PX4 may take a repetition of any of these items for the last item, and confirm the upload. A confirmation
-            # then does not prove that it has all items.
+            # PX4 may take any repeated item near the end for the last item, and confirm the upload although it does
+            # not have all items.
             self._was_tail_repeated = True
         # One more than the window, because the vehicle may already have the first unconfirmed item.
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)

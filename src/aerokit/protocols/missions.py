@@ -167,7 +167,7 @@ class MissionClear(MissionExchange[None]):
             self._has_error = True
             self._repeat(now)
         elif message.type == MavMissionResult.ERROR and now - self._sent_at < (self.round_trip.fastest_s or 0.0) / 2:
-            return  # This ERROR is too early to answer the repetition.
+            return  # This ERROR is too early to answer the repeated request.
         # OPERATION_CANCELLED and INVALID_SEQUENCE answer an earlier upload, so they are ignored.
         elif message.type not in (MavMissionResult.OPERATION_CANCELLED, MavMissionResult.INVALID_SEQUENCE):
             self._reject(message.type)

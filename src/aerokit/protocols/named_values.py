@@ -215,7 +215,7 @@ class NamedReads(NamedRequests[ValueT]):
     """
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
-    _is_probe_wanted = False  # True if `PROBE` is requested together with the next requests
+    _is_probe_wanted = False  # True if the next requests must include the probe
     _probes_sent = 0
     _probes_answered = 0
 

@@ -36,8 +36,8 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
     return Parameter(known.name, value, type_, default=known.default, index=index)
 
 
-# Maximum seconds between two parts of a list. ArduPilot sends parts ten times a second, or once a second (MAV1_PARAMS).
-MAX_PART_INTERVAL_S = 1.1
+# Maximum seconds between two groups of values of a list. ArduPilot sends ten groups a second, or one (MAV1_PARAMS).
+MAX_GROUP_INTERVAL_S = 1.1
 
 # If at most this many values are left in the stream, its time-out is shorter. Values that are then requested too early
 # arrive twice, which costs little.
@@ -203,8 +203,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed_count < MIN_STREAMED:  # A single value may be the answer to our request by index.
             return max(seconds, MIN_START_TIMEOUT_S)
-        # Near the end, waiting for a further part of the list would take longer than requesting the rest.
-        return seconds if self._is_near_end else max(seconds, MAX_PART_INTERVAL_S)
+        # Near the end, waiting for a further group of values would take longer than requesting the rest.
+        return seconds if self._is_near_end else max(seconds, MAX_GROUP_INTERVAL_S)
 
     @property
     def _is_near_end(self) -> bool:

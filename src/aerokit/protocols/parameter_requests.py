@@ -157,7 +157,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # A delayed message may have had the old value, so we read once more.
+                self._window.request(name)  # A delayed message may contain the old value, so we read once more.
             else:
                 self._set_result(name, reported, now)
                 self._reject_alternatives(name, now)
@@ -286,7 +286,7 @@ class ParameterWrites(ParameterRequests):
         before = self._before.get(name)  # None if unknown
         may_be_unchanged = before is None or same_value(reported.value, before)
         if may_be_unchanged and not is_as_requested:
-            self._to_set.add(name)  # The value may still be the old one, so PARAM_SET is sent again.
+            self._to_set.add(name)  # The vehicle may still have the old value, so PARAM_SET is sent again.
         is_conclusive = answers.are_conclusive(is_unchanged=may_be_unchanged)
         may_be_late = may_be_unchanged or name in self._may_be_late
         if is_conclusive and may_be_late and now < self._started_at + LATE_ANSWERS_S:

@@ -243,7 +243,7 @@ class SimulatedAutopilot(SimulatedVehicle):
 _DISCHARGE_CURVE = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
 
 
-# Straight lines between neighbouring points, from full to empty: lower end in percent, its volts, volts per percent.
+# Lines between the points of _DISCHARGE_CURVE, fullest first: percentage and volts of the lower end, volts per percent.
 _DISCHARGE_SEGMENTS = tuple(
     (low, volts, (high_volts - volts) / (high - low)) for (low, volts), (high, high_volts) in pairwise(_DISCHARGE_CURVE)
 )[::-1]

@@ -213,7 +213,7 @@ class Motion:
     def stopping_place(self) -> Ned:
         """The place ahead at which :meth:`seek_position` stops the vehicle without flying back."""
         speed, deceleration = self.ground_speed_m_s, BRAKING_SHARE * self.limits.acceleration_m_s2
-        # At the distance `speed * seconds`, `approach_speed` returns the present speed.
+        # `approach_speed` returns the present speed if the target is `speed * seconds` metres away.
         seconds = 1.0 if speed <= deceleration else speed / (2.0 * deceleration) + deceleration / (2.0 * speed)
         return (self.north + self.velocity_north * seconds, self.east + self.velocity_east * seconds, self.down)
 

@@ -121,7 +121,7 @@ class ArduPilotParameterServer(ParameterServer):
         else:
             value = self.clamped(name, request.param_value)
             self._parameters[name] = rounded(value, self._parameters.type(name))
-            if self.sends_errors:  # The released firmware also confirms the value on the sender's port.
+            if self.sends_errors:  # Firmware that sends PARAM_ERROR also confirms the value on the sender's port.
                 self.send(name, UNKNOWN_INDEX, channel)
             self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
 
@@ -187,7 +187,7 @@ class Px4ParameterServer(ParameterServer):
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name, parameters = request.param_id, self._parameters
-        if name == HASH_NAME:  # A client that has cached the parameters stops the list by this request.
+        if name == HASH_NAME:  # A client that has cached the parameters sets _HASH_CHECK to stop the list.
             self.stop_list(channel)
         code = self._error_for(name, request.param_type)
         if code is not None:

@@ -81,8 +81,8 @@ class SimulatorServer:
         self._timer_at = 0.0  # loop time at which the timer fires
         self._exit = AsyncExitStack()  # closes the links at the end of the block
         # The task that entered the `async with` block. A failing vehicle cancels this task.
-        self._owner: asyncio.Task[Any] | None = None
-        self._cancels_owner = False  # True if the owner was cancelled because of `failure`
+        self._block_task: asyncio.Task[Any] | None = None
+        self._has_cancelled_block = False  # True if `_fail` has cancelled the task
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
         """Called with every datagram: simulated time, bytes, and True if a vehicle has sent the datagram."""
         self.failure: Exception | None = None
@@ -105,7 +105,7 @@ class SimulatorServer:
         if self._loop is not None:
             raise BusyError("this SimulatorServer was already started once; create a new SimulatorServer")
         self._loop = asyncio.get_running_loop()
-        self._owner = asyncio.current_task()
+        self._block_task = asyncio.current_task()
         add_source = getattr(self._loop, "add_event_source", None)  # None unless the loop is a `VirtualClockLoop`
         if add_source is None and len(self.vehicles) > _BATCH_THRESHOLD:
             self._min_wait_s = max(_MIN_BATCH_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
@@ -140,12 +140,12 @@ class SimulatorServer:
     def _end(self, error: BaseException | None) -> None:
         """Stop, and raise the failure of a vehicle, if there is one."""
         self._stop()
-        owner = self._owner
-        self._owner = None
-        if self._cancels_owner and owner is not None and owner is asyncio.current_task():
-            _uncancel(owner)
+        task = self._block_task
+        self._block_task = None
+        if self._has_cancelled_block and task is not None and task is asyncio.current_task():
+            _uncancel(task)
         if self.failure is not None and self.failure is not error:
-            raise self.failure  # Its context is `error`.
+            raise self.failure  # Python makes `error` the context of this exception.
 
     def wake(self) -> None:
         """Run all events that are due. Call this method after a change of a fault or of a value of a vehicle.
@@ -180,11 +180,11 @@ class SimulatorServer:
         self._stop()
         for link in self._links:
             link.close()
-        owner = self._owner
-        if owner is None or owner.done():  # The task of a pytest fixture may end before the block ends.
+        task = self._block_task
+        if task is None or task.done():  # The task of a pytest fixture may end before the block ends.
             return
-        if owner is not asyncio.current_task():  # In a callback, asyncio would only log the exception.
-            self._cancels_owner = owner.cancel()
+        if task is not asyncio.current_task():  # In a callback, asyncio would only log the exception.
+            self._has_cancelled_block = task.cancel()
 
     def _stop(self) -> None:
         if self._timer is not None:

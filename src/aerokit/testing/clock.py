@@ -116,10 +116,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # Nothing to run. The next iteration polls if a poll is due, and otherwise runs the event sources again.
+            # If a poll is due, the next iteration polls. Without timers, it runs the event sources again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
-            # Otherwise, the next event is a timer.
+            # No event source is due before the next timer, so the clock jumps to the timer.
             self._now = max(self._now, self._next_timer())
         self._schedule_sources_before_timer()
         end = self._now + self._clock_resolution

@@ -326,9 +326,8 @@ class _IncomingPath:
             self._in_flight.put(due, partial(self._receiver.bytes_received, piece, peer))
 
     def link_lost(self, error: LinkLost) -> None:
-        # Frames in transit are delivered first.
         self._on_lost()
-        if not self._is_closed:
+        if not self._is_closed:  # The receiver first gets the frames in transit.
             self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
 
     def link_stalled(self, unsent_bytes: int) -> None:

@@ -53,7 +53,7 @@ def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
     marked = getattr(rewriting, "_must_rewrite", None)  # pytest has no public API to exclude a package.
     if rewriting is not None and isinstance(marked, set):
         marked -= {name for name in marked if name.partition(".")[0] == "aerokit"}
-        rewriting.mark_rewrite()  # This call clears the cached decisions.
+        rewriting.mark_rewrite()  # This call clears pytest's cache of the modules to rewrite.
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -191,7 +191,7 @@ def _is_of_this_package(value: object) -> bool:
 
 def _fleets(item: pytest.Item) -> list[SimulatedFleet]:
     """Return the fleets of a test that the plugin has to open."""
-    # A served flight (without `run`) is open already.
+    # A `ServedFlight` has no `run`, because it is already open.
     return [getattr(value, "_fleet", value) for value in _flight_fixtures(item) if hasattr(value, "run")]
 
 

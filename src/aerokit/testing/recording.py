@@ -21,7 +21,7 @@ MAX_GAP_S = 60.0
 
 _ITEMS = (m.MissionItemInt, m.MissionItem)
 _COMMANDS = (m.CommandLong, m.CommandInt)
-# Messages that answer requests of the recorded client. The played vehicle does not send them by itself.
+# Messages that answer requests of the recorded client. The replayed vehicle sends them only on request.
 _ANSWER_IDS = frozenset(
     kind.ID
     for kind in (

@@ -326,7 +326,7 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
         append_point()
         vehicle.every(interval_s, append_point)
 
-    # Recording uses the vehicle's timers, and changes neither its messages nor its random numbers.
+    # Recording does not change the flight: it sends no messages, and draws none of the vehicle's random numbers.
     vehicle.on_power_on(start_recording)
     return track
 

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-# What `Conversion.written` counts for each suffix; for other suffixes, it counts rows. An .mcap file has more messages
-# than the log has entries, because each changed state is a message, too.
+# What `Conversion.written` counts, by suffix of the converted file. For all other suffixes, it counts rows.
 _WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 _REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 

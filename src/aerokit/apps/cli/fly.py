@@ -176,8 +176,8 @@ class PlanFlight(SupervisedFlight):
         return DONE
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # "land" and "return" are missing, because a failsafe may have set these modes. "hold" is included only before
-        # the start of the mission, because a cancelled start ends in this mode.
+        # A failsafe may have set a mode to land or return, so these modes do not count as set by this program. A
+        # cancelled start of the mission ends in a mode to hold.
         return ("mission",) if self._has_changed_mode else ("mission", "hold")
 
 

@@ -235,7 +235,7 @@ def _printing_kept_name(path: str | None) -> Iterator[None]:
     if path is None or not os.path.isfile(path):
         yield
         return
-    # The link logs the new name, but Textual hides log messages.
+    # The link logs the new name of the renamed file, but Textual hides log messages.
     earlier = os.stat(path)
     yield
     for kept in Path(path).resolve().parent.iterdir():

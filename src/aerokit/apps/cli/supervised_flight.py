@@ -187,7 +187,7 @@ class SupervisedFlight(ABC):
                 self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
-            # The vehicle is still armed, so it gets the command for a flying vehicle.
+            # Disarming has failed, so the vehicle gets the command for a flying vehicle.
         text = INTERRUPT_ACTIONS[action]
         self._print(text if action == "nothing" else f"{text}; Ctrl-C exits at once")
         try:
@@ -221,7 +221,7 @@ class SupervisedFlight(ABC):
         )
         armed = self._vehicle.armed
         with suppress(OperationTimeout):
-            # If the vehicle arms, `Vehicle.arm` disarms it again in the background.
+            # If the vehicle arms, a background task of `Vehicle.arm` disarms it again.
             await armed.wait_until(bool, timeout=ARM_WATCH_S)
             await armed.wait_until(lambda is_armed: not is_armed, timeout=_AUTO_DISARM_TIMEOUT_S)
         self._print(self._vehicle.describe_now())
@@ -410,7 +410,7 @@ class FlightReport:
 
     def _is_about_mode(self, text: str) -> bool:
         """Return True for a text like "Arm: AUTO mode not armable"."""
-        # `Vehicle.arm` changes such a mode by itself.
+        # This text needs no attention, because `Vehicle.arm` then changes the mode and arms again.
         autopilot = self._vehicle.autopilot
         mode = self._vehicle.mode_name
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"

@@ -133,7 +133,7 @@ def _enum_schema(name: str) -> dict[str, Any] | None:
         return None
     names = {"enum": [member.name for member in enum]}
     name_lists = [{"type": "array", "items": names}] if issubclass(enum, Flag) else []
-    # A value without a name is an integer.
+    # An enum value without a name is an integer.
     return {"description": f"of {enum.__name__}", "anyOf": [names, *name_lists, {"type": "integer"}]}
 
 

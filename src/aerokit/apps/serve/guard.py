@@ -37,7 +37,7 @@ REQUEST_TIMEOUT_S = 10.0
 
 def check_token(token: str) -> str:
     if not (MIN_TOKEN_LENGTH <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
-        # The text does not contain the token.
+        # The error may be logged, so its text does not contain the token.
         raise InvalidArgument(
             f"a token must have {MIN_TOKEN_LENGTH} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this token has"
             f" {len(token)}{'' if set(token) <= _TOKEN_CHARACTERS else ', some of which are not allowed'}"

@@ -102,7 +102,7 @@ ERRORS: Mapping[int, tuple[str, str]] = {
 }
 """Maps the number of a subsystem to the kind of failsafe and a description of the error."""
 
-# Maps pairs of subsystem and error code to details of the error.
+# Maps (subsystem, error code) of ArduPilot's ERR records to details of the error.
 _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (2, 2): "late frames",
     (11, 2): "glitch",

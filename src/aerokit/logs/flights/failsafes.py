@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 _SAME_KIND_GAP_S = 8.0
 # Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
 _GENERAL_GAP_S = 3.0
-# This is the maximum time if the autopilot delays its reaction. Without satellites, autopilots continue with dead
+# Replaces _GENERAL_GAP_S if the autopilot delays its reaction. Without satellites, autopilots continue with dead
 # reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
 _DELAYED_REACTION_GAP_S = 10.0
-# A reaction is a mode change or disarming within these times after the last evidence.
+# A mode change or disarming is a reaction if it follows the last evidence of a failsafe within this time.
 _REACTION_TIMEOUT_S, _DISARMING_TIMEOUT_S = 12.0, 3.0
 # The reaction may be logged this long before the first evidence of the failsafe.
 _EARLY_MODE_CHANGE_S, _EARLY_DISARMING_S = 2.5, 0.5
-# Evidence counts from this long before arming until this long after disarming.
+# Evidence of a failsafe counts from this long before arming until this long after disarming.
 _BEFORE_ARMING_S, _AFTER_DISARMING_S = 1.0, 2.0
 # A failsafe is shown with values that were measured in this time before it.
 _BEFORE_S = 10.0

@@ -95,7 +95,7 @@ def _descents(flight: FlightLog) -> Iterator[_Descent]:
             sink_m_s = max(sink_m_s, down_m_s) if is_recent else down_m_s
             last_fast_s = time_s
         elif down_m_s < _STOPPED_M_S:
-            # The stop may take longer if the log has few velocities.
+            # If the log has few velocities, even a sudden stop seems to take longer.
             max_stop_s = max(_IMPACT_S, 1.5 * min(time_s - previous_s, _MAX_INTERVAL_S))
             was_fast = last_fast_s > begin_s
             if was_fast and time_s - last_fast_s <= max_stop_s:

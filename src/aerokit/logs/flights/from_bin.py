@@ -148,7 +148,7 @@ class _Tables:
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        # Rows have no checksum. `TimeSeries` would use a time that is too late for all later rows, too.
+        # Rows have no checksum, so a time may be damaged. In a `TimeSeries`, no later row could have an earlier time.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time

@@ -239,7 +239,7 @@ class _Reader:
         # Use destinations (POSITION_TARGET_GLOBAL_INT) only if the log has no continuous set-points.
         if setpoints.has("latitude_deg"):
             return
-        has_heights = setpoints.has()  # NAV_CONTROLLER_OUTPUT has heights without positions
+        has_heights = setpoints.has()  # Set-points from NAV_CONTROLLER_OUTPUT have heights, but no positions.
         rows = list(_rows_of(setpoints))
         for time, latitude, longitude, amsl, relative in _rows_of(destinations):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
@@ -329,7 +329,7 @@ class _Reader:
             overlaps = (min(end_s, s.ends_s) - max(begin_s, s.begins_s) for s in self._flight.silences)
             return sum(max(overlap_s, 0.0) for overlap_s in overlaps)
 
-        # The report describes silences, in which no message at all arrived, separately.
+        # Silences, in which no message at all arrived, are left out: the report describes them separately.
         missing_s = sum(end - begin - silent_s(begin, end) for begin, end in self._armed_gaps)
         if missing_s > _MAX_HEARTBEAT_INTERVAL_S:
             self._flight.notes.append(

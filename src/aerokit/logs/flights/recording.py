@@ -31,8 +31,8 @@ class ClockComparison:
         self._previous: tuple[float, int] = (-math.inf, 0)
         self._recorded_s = 0.0
         self._vehicle_s = 0.0
-        # The same sums for long intervals of the vehicle's clock. The recording computer has slept during such an
-        # interval, or the vehicle is a fast simulation.
+        # Sums of the intervals in which the vehicle's clock has advanced by _MAX_CLOCK_GAP_S or more: the recording
+        # computer has slept, or the vehicle is a fast simulation.
         self._long_recorded_s = 0.0
         self._long_vehicle_s = 0.0
 
@@ -54,7 +54,7 @@ class ClockComparison:
     def speed(self) -> float:
         """Seconds by which the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
         recorded_s, vehicle_s = self._recorded_s, self._vehicle_s
-        if not self._is_comparable:  # A fast simulation may have only long intervals.
+        if not self._is_comparable:  # In the log of a fast simulation, all intervals may be long.
             recorded_s, vehicle_s = recorded_s + self._long_recorded_s, vehicle_s + self._long_vehicle_s
             if min(recorded_s, vehicle_s) < _MIN_CLOCK_COMPARISON_S:
                 return 1.0
@@ -126,7 +126,7 @@ class LinkCounter:
         """Add a row for the counted second, and start to count ``second``."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        # No frames arrived in the seconds between these two. The first and the last of them get a row.
+        # In the seconds between `self._second` and `second`, no frames arrived. The first and the last get a row.
         if second - self._second > 1:
             self._series.add(self._second + 1, *_ALL_LOST)
             self._series.add(second - 1, *_ALL_LOST)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
     from aerokit.mavlink.message import Message
 
-# The `fields` of a record with a MAVLink message: its values are in `message`.
+# A record with a MAVLink message has no `fields`, because its values are in `message`.
 _NO_FIELDS: Mapping[str, Any] = {}
 _PARAMETER_IDS = frozenset((Heartbeat.ID, AutopilotVersion.ID, ParamSet.ID, ParamValue.ID))
 
@@ -203,7 +203,7 @@ class _VehicleStates:
         names = self._states_by_message.get(type(message).__name__, ())
         if names or may_have_texts:
             if message.received_frame is not None:
-                message.received_frame.received_at = now  # Telemetry takes this as the states' time.
+                message.received_frame.received_at = now  # Telemetry gives this time to the states.
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
             telemetry.expire(now)  # publishes status texts whose last parts are missing

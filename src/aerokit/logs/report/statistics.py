@@ -220,7 +220,7 @@ def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> floa
     counted: tuple[float, float] | None = None  # the end of the last step that `length_m` includes
     previous_row = None
     for row in rows:
-        if previous_row != row - 1:  # A span begins. The way from the end of the previous span is unknown.
+        if previous_row != row - 1:  # A gap in `rows`: the way between the two points is unknown.
             counted = None
         previous_row = row
         point = north_east[row]

@@ -45,7 +45,7 @@ def camera_settings(camera: CameraDevice) -> m.CameraSettings:
 
 def _number(command: ReceivedCommand | None) -> int:
     """Return the requested number of a storage or stream. 0 means all."""
-    # None stands for a message that is streamed.
+    # `command` is None for a message that is streamed.
     return 0 if command is None else to_int(command.param2)
 
 

@@ -98,7 +98,7 @@ class MessageStreams:
         message_id = to_int(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
-        # This channel would otherwise also get the stream to all channels.
+        # Stop the stream to all channels: this channel would get it in addition to its own stream.
         self._streams.pop((None, message_id), None)
         # 0 requests the default rate. There is none, so the stream stops, as with -1.
         is_accepted = self.stream(message_id, to_int(command.param2) / 1e6, command.channel)

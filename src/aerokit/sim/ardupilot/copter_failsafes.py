@@ -153,7 +153,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             return
         is_silent = copter.now - self.radio_received_at >= parameters["RC_FS_TIMEOUT"]
         self._radio_good_at = math.nan
-        # With a low throttle, the failsafe starts at once. Without pulses, it starts after RC_FS_TIMEOUT.
+        # A receiver reports a lost transmitter by a low throttle, or by sending no pulses (for RC_FS_TIMEOUT).
         if is_receiving or is_silent:
             self._set_radio_lost(is_lost=True)
 

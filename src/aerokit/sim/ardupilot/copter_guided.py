@@ -249,7 +249,7 @@ class CopterSetpoints:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_position_missing = point is None and Setpoint.of(target).has_position
-        # Without a position in the message, `_follow` does not use the point.
+        # If the message has no position, `_follow` ignores its argument `point`.
         is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
         if not is_followed:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.

@@ -190,7 +190,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _resume_pending(self) -> None:
         if self._is_long_pending and not self._is_in_take_off:
             self._is_long_pending = False
-            # If the plane has left TAKEOFF, the failsafe is dropped.
+            # If the plane has left TAKEOFF, the pending failsafe is dropped.
             if self.vehicle.mode.number == PlaneMode.TAKEOFF:
                 self._start_long(_LONG)
 

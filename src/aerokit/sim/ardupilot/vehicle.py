@@ -260,7 +260,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
-        # With the timelines of SITL, the delay is about half a second.
+        # SITL leaves its boot state about half a second later.
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:

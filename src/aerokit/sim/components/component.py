@@ -137,7 +137,7 @@ class SimulatedComponent:
         vehicle.on_power_on(self._on_vehicle_power_on)
 
     def _on_vehicle_power_on(self) -> None:
-        if math.isnan(self._booted_at):  # When the vehicle reboots, the component keeps running.
+        if math.isnan(self._booted_at):  # A reboot of the vehicle does not reboot its components.
             self.reboot()
 
     def reboot(self) -> None:

@@ -38,7 +38,7 @@ from aerokit.sim.px4.payload import Px4CameraTrigger, Px4Gimbal
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Px4Storage, px4_parameters
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
-# Shares of the boot time after which events happen.
+# Shares of the boot time after which the streams start, and pre-arm warnings are sent.
 _HEARTBEAT_BOOT_SHARE, _WARNING_BOOT_SHARE = 0.2, 0.3
 _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
@@ -207,7 +207,7 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()  # A restart has created a new object.
+        self.failsafes.listen()  # The boot has created this object anew.
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 

@@ -73,7 +73,7 @@ _FAILURES = {
 def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
-    # The answers are those of SIH. The failures have no effect.
+    # The answers are those of PX4's own simulation (SIH). The failures have no effect.
     unit, failure_type = to_int(command.param1), to_int(command.param2)
     if unit not in _FAILURES:
         return None

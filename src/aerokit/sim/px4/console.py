@@ -118,7 +118,7 @@ class Px4LogStream:
         padded = data.ljust(_LOGGING_BYTES, b"\0")
         block = message_class(*self._client, sequence, len(data), first_message_offset, padded)
         self._px4.send(block, self._channel)
-        if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.
+        if not self._sends_definitions:  # A block of ULog definitions is sent again until it is acknowledged.
             self._sequence += 1
         self._schedule_block(stream)
 

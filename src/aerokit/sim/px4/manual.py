@@ -111,7 +111,7 @@ class Px4ManualFlight:
 
     def enter(self) -> None:
         self._place = self._down = None
-        # `update` changes this limit.
+        # Restore the limit, which `update` changes.
         self._px4.motion.limits.turn_rate_rad_s = self._turn_rate_rad_s
 
     @property

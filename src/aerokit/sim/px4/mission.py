@@ -48,7 +48,7 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
             if has_place:
                 return "takeoff not first waypoint item"
         has_place = has_place or item.command in _WITH_PLACE
-    # Glide slopes are not checked.
+    # PX4 also checks the glide slope of a landing, which is not simulated.
     return _missing_landing(px4, items) or _landing_problem(items)
 
 
@@ -57,7 +57,7 @@ def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
         return None
     takes_off = any(item.command in _TAKE_OFFS for item in items)
     lands = any(item.command in _LANDINGS for item in items)
-    # The default of planes is 2.
+    # The default of planes is 2: a landing is required.
     required = round(px4.parameters["MIS_TKO_LAND_REQ"])
     if required == 1 and not takes_off:
         return "Takeoff waypoint required."
@@ -293,7 +293,7 @@ class Px4Mission:
         target = self._place(item)
         north, east, down = target
         has_heading = item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
-        px4.flight.heading = math.radians(item.param4) if has_heading else None  # None to look ahead
+        px4.flight.heading = math.radians(item.param4) if has_heading else None
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(down if item.command in _TAKE_OFFS else None)
         elif item.command in _LANDINGS:
@@ -393,7 +393,7 @@ class Px4Mission:
     def _finish(self) -> None:
         px4 = self._px4
         self.is_finished = self._needs_selection = True
-        self.current = max(0, min(self.current, self.count - 1))  # The last item stays current.
+        self.current = max(0, min(self.current, self.count - 1))  # After the last item, that item stays current.
         if px4.is_landed:
             px4.info("Mission finished, landed")
             return

@@ -201,7 +201,7 @@ class Px4MissionServer(MissionServer):
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         link = self._link(channel)
-        link.uses_int = isinstance(request, m.MissionRequestInt)  # PX4 does this even for another client.
+        link.uses_int = isinstance(request, m.MissionRequestInt)  # PX4 sets this even if another client is the sender.
         if sender_of(request) != link.client:
             self._warn("WPM: REJ. CMD: partner id mismatch")
             return
@@ -212,7 +212,7 @@ class Px4MissionServer(MissionServer):
         link.received_at = self._px4.now
         if request.seq == link.next and link.next < link.end:
             link.next += 1
-        # A request for the next item and a repeated request are now both for `next - 1`.
+        # `next - 1` is now the index in both valid requests: for the next item, and for the previous item again.
         if request.seq == link.next - 1 and request.seq < self.count(link.mission_type):
             self._send_item(link, request.seq)
         else:
@@ -273,7 +273,7 @@ class Px4MissionServer(MissionServer):
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
         link = self._link(channel)
-        link.uses_int = isinstance(message, m.MissionItemInt)  # PX4 does this even for another client.
+        link.uses_int = isinstance(message, m.MissionItemInt)  # PX4 sets this even if another client is the sender.
         if sender_of(message) != link.client:
             self._warn("REJ. MIS ITEM: partner id mismatch")
         elif message.mission_type != link.mission_type:
