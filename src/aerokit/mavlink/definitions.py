@@ -378,7 +378,7 @@ def _common_prefix(enum: str, names: list[str]) -> str:
     enum_prefix = enum + "_"
     if sum(name.startswith(enum_prefix) for name in names) * 2 > len(names):
         return enum_prefix
-    # The last word of an entry is never part of the prefix. A single entry is compared with the enum's name.
+    # The last word of an entry's name is never part of the prefix. A single name is compared with the enum's name.
     split_names = [name.split("_")[:-1] for name in names]
     if len(names) == 1:
         split_names.append(enum.split("_"))

@@ -213,8 +213,7 @@ class MissionUpload(MissionExchange[UploadResult]):
                 self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_requesting:
-                # Either the vehicle already has the item that was sent, or it has not received one of the preceding
-                # items.
+                # The vehicle answers so if it already has the item, or if a preceding item is missing.
                 self._send_window(now, ahead=1)
                 if self._outbox:  # If nothing was sent, the present deadline stays.
                     self._wait(now)

@@ -247,7 +247,7 @@ class SimulatorServer:
         if due == math.inf:
             return
         if self._timer is not None:
-            if self._timer_due == due:  # The present timer is still right.
+            if self._timer_due == due:  # The timer is already set to this time.
                 return
             self._timer.cancel()
         when = self._loop_time(due)

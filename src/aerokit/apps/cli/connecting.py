@@ -259,7 +259,7 @@ async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> Asy
 
     With ``reconnect``, a lost link is opened again.
     """
-    # Tests use a `Link` in place of the address. It cannot be opened again.
+    # Tests use a `Link` instead of an address. A `Link` cannot be opened again.
     link: str | Link = options.address
     async with open_connection(
         link,

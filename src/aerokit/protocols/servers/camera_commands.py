@@ -76,7 +76,7 @@ class _Pictures:
         in_wrong_mode = _has_wrong_mode(camera, wrong_mode=CameraMode.VIDEO, unless_can=_CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
-        if not _selects_this(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
+        if not _selects_this_camera(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
             return MavResult.DENIED
         single = (command.sender, sequence) if count == 1 and sequence > 0 else None
         # A single image with the same sender and sequence number is not taken again.
@@ -92,7 +92,7 @@ class _Pictures:
         return MavResult.ACCEPTED
 
     async def stop(self, command: ReceivedCommand) -> int:
-        if not _selects_this(command.param1):
+        if not _selects_this_camera(command.param1):
             return MavResult.DENIED
         self._camera.captures.stop()
         return MavResult.ACCEPTED
@@ -104,7 +104,7 @@ class _Pictures:
 
     async def format(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures
-        if not _selects_this(command.param1):
+        if not _selects_this_camera(command.param1):
             return MavResult.DENIED
         if captures.is_busy or captures.is_recording:
             return MavResult.TEMPORARILY_REJECTED
@@ -231,9 +231,9 @@ class _Settings:
         return MavResult.ACCEPTED
 
 
-def _selects_this(number: float) -> bool:
-    # 0 selects all, 1 the first. MAVSDK sends NaN.
-    return math.isnan(number) or number in (0.0, 1.0)
+def _selects_this_camera(target_camera: float) -> bool:
+    # 0 selects all cameras, 1 the first one. MAVSDK sends NaN.
+    return math.isnan(target_camera) or target_camera in (0.0, 1.0)
 
 
 def _has_wrong_mode(camera: CameraDevice, *, wrong_mode: int, unless_can: int) -> bool:

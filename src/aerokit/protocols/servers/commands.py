@@ -273,7 +273,7 @@ class RunningCommands:
     def _record_result(self, command: ReceivedCommand, result: CommandResult) -> None:
         # Each sender has its own entry, because a repetition may arrive after the same command of another sender.
         key = (command.command, command.sender)
-        self._ended.pop(key, None)  # The new entry must be the last one.
+        self._ended.pop(key, None)  # Otherwise the new entry would keep the place of the old one.
         if len(self._ended) >= MAX_RESULTS:
             del self._ended[next(iter(self._ended))]
         self._ended[key] = EndedCommand(command, result, self._host.now)

@@ -86,7 +86,7 @@ class Px4MissionServer(MissionServer):
         return [as_downloaded(item, as_int=True) for item in self.lists.get(mission_type, ())]
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        # PX4 itself has no such operation.
+        # PX4 itself does not store lists from files.
         if mission_type not in _CAPACITIES or start or not clear:
             return Result.ERROR
         stored_items: list[MissionItem] = []
@@ -228,7 +228,7 @@ class Px4MissionServer(MissionServer):
             link.received_at = self._px4.now
             link.state = TransferState.IDLE
         elif link.state is TransferState.GETTING and ack.type == Result.UNSUPPORTED:
-            # The upload goes on with the other kind of request.
+            # Continue the upload with MISSION_REQUEST instead of MISSION_REQUEST_INT, or vice versa.
             link.uses_int = not link.uses_int
             self._request_item(link)
         elif link.state is TransferState.GETTING and ack.type == Result.OPERATION_CANCELLED:
