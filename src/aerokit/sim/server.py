@@ -82,7 +82,7 @@ class SimulatorServer:
         self._exit = AsyncExitStack()  # closes the links at the end of the block
         # The task that entered the `async with` block. A failing vehicle cancels this task.
         self._block_task: asyncio.Task[Any] | None = None
-        self._has_cancelled_block = False  # True if `_fail` has cancelled the task
+        self._has_cancelled_block = False  # True if `_fail` has cancelled `_block_task`
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
         """Called with every datagram: simulated time, bytes, and True if a vehicle has sent the datagram."""
         self.failure: Exception | None = None

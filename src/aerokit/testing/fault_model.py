@@ -97,7 +97,7 @@ class FaultyPath:
         self._chance = random.Random(repr(seed)).random  # decides which frames have a fault
         self._bits = random.Random(repr((seed, "bits")))  # selects the bits to flip
         self._air = Air() if air is None else air
-        self._started_at: float | None = None  # None until the clock of the outages starts
+        self._started_at: float | None = None  # time 0 of the outages; None before `start`
         self._latest_due = -math.inf  # arrival of the last frame that was not reordered
 
     def start(self, now: float) -> None:

@@ -163,7 +163,7 @@ class SupervisedFlight(ABC):
         elif self._is_armed_on_ground and self._is_in_our_mode:
             await self._disarm()
         else:
-            # In the air, the pilot or a failsafe decides.
+            # A vehicle in the air is left to its pilot or its failsafes.
             self._print(f"no command is sent: vehicle {vehicle.describe_now()}")
         return DONE
 

@@ -119,7 +119,7 @@ def _fall(flight: FlightLog, descent: _Descent) -> Fall | None:
     # If the log ends during the descent, the vehicle must reach the ground within two more seconds at this rate.
     hits_ground_soon = end_height_m < 2 * sink_m_s
     is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else hits_ground_soon
-    if not (is_on_ground or reasons):  # Logged reasons suffice at any height.
+    if not (is_on_ground or reasons):  # With a logged reason, the height does not matter.
         return None
     return Fall(
         time_s=end_s,

@@ -367,7 +367,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     farthest = max(range(len(distances)), key=distances.__getitem__)
     if distances[farthest] <= tolerance:
         return [path[0], path[-1]]
-    middle = farthest + 1  # Index in `path`. The first point of `path` has no distance.
+    middle = farthest + 1  # `distances` begins with the second point of `path`.
     # Both halves contain the middle point, so `[:-1]` removes it from the first half.
     return simplify(path[: middle + 1], tolerance)[:-1] + simplify(path[middle:], tolerance)
 

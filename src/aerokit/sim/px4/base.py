@@ -207,7 +207,7 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()  # The boot has created this object anew.
+        self.failsafes.listen()  # A reboot has created a new `failsafes`.
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 
