@@ -149,7 +149,7 @@ async def test_invalid_arguments_are_refused() -> None:
         assert not flight.faults.all.gps_lost
     with pytest.raises(RuntimeError, match="is not open"):
         _ = flight.vehicle
-    with pytest.raises(InvalidArgument, match="a single kind"):
+    with pytest.raises(InvalidArgument, match="only with one"):
         open_fleet("copter", "px4", count=2)
 
 
