@@ -33,12 +33,11 @@ typedef struct {
 enum { STATE_OBJECTS = offsetof(State, crc) / sizeof(PyObject *) };
 
 static unsigned u16(const uint8_t *at) { return (unsigned)(at[0] | at[1] << 8); }
+static uint32_t u32(const uint8_t *at) { return u16(at) | (uint32_t)u16(at + 2) << 16; }
+static uint64_t u64(const uint8_t *at) { return u32(at) | (uint64_t)u32(at + 4) << 32; }
 
-static uint64_t little_endian(const uint8_t *at, int size) {
-    uint64_t value = 0;
-    for (int i = size - 1; i >= 0; i--)
-        value = value << 8 | at[i];
-    return value;
+static uint32_t message_id_of(const uint8_t *frame) {
+    return frame[0] == MAGIC_V1 ? frame[5] : u16(frame + 7) | (uint32_t)frame[9] << 16;
 }
 
 static void put_little_endian(uint8_t *at, int size, uint64_t value) {
@@ -156,7 +155,7 @@ static PyObject *make_frame(State *state, const uint8_t *raw, Py_ssize_t size, P
     if (frame == NULL)
         return NULL;
     int is_v1 = raw[0] == MAGIC_V1, length = raw[1];
-    frame->message_id = is_v1 ? raw[5] : (uint32_t)little_endian(raw + 7, 3);
+    frame->message_id = message_id_of(raw);
     frame->checksum = (unsigned short)u16(raw + (is_v1 ? 6 : 10) + length);
     frame->system_id = raw[is_v1 ? 3 : 5];
     frame->component_id = raw[is_v1 ? 4 : 6];
@@ -306,15 +305,15 @@ static PyObject *decode_number(int kind, const uint8_t *at) {
     case 'B': return PyLong_FromLong(at[0]);
     case 'h': return PyLong_FromLong((int16_t)u16(at));
     case 'H': return PyLong_FromLong((long)u16(at));
-    case 'i': return PyLong_FromLong((int32_t)little_endian(at, 4));
-    case 'I': return PyLong_FromLongLong((long long)little_endian(at, 4));
-    case 'q': return PyLong_FromLongLong((int64_t)little_endian(at, 8));
-    case 'Q': return PyLong_FromUnsignedLongLong(little_endian(at, 8));
+    case 'i': return PyLong_FromLong((int32_t)u32(at));
+    case 'I': return PyLong_FromLongLong(u32(at));
+    case 'q': return PyLong_FromLongLong((int64_t)u64(at));
+    case 'Q': return PyLong_FromUnsignedLongLong(u64(at));
     case 'f':
-        single.bits = (uint32_t)little_endian(at, 4);
+        single.bits = u32(at);
         is_signalling = (single.bits & 0x7FC00000) == 0x7F800000 && single.bits & 0x3FFFFF;
         return is_signalling ? NULL : PyFloat_FromDouble(single.number);
-    default: return PyFloat_FromDouble((Double){.bits = little_endian(at, 8)}.number);
+    default: return PyFloat_FromDouble((Double){.bits = u64(at)}.number);
     }
 }
 
@@ -584,12 +583,13 @@ static PyObject *table_decode(PyObject *object, PyObject *frame) {
 
 /* -------------------------------------------------------------------------------------------- framing */
 
+enum { KEYS = 16 };
+
 typedef struct {
     PyObject_HEAD
     PyObject *wanted, *statistics, *rest, *sources, *table;
-    PyObject *last_key; /* `last_key_number` as a Python int */
-    void *memory;       /* not used, but required by OWNER */
-    long last_key_number; /* key of the last sender */
+    PyObject *keys[KEYS]; /* keys of senders: the objects in ``sources``, because a lookup of the same object is faster */
+    void *memory;         /* not used, but required by OWNER */
     int is_out_of_order;  /* 1 if a frame of the last call was out of order */
     int is_simple; /* 1 if ``rest`` is the beginning of one plausible frame, 0 if the attribute `_scan` describes it */
 } Framer;
@@ -601,7 +601,7 @@ static PyMemberDef framer_members[] = {
     OBJECT("_sources", sources), OBJECT("_table", table), {0},
 };
 
-OWNER(framer, Framer, wanted, 6)
+OWNER(framer, Framer, wanted, 5 + KEYS)
 
 /* State of one call of `receive`. It owns references to its objects. */
 typedef struct {
@@ -629,7 +629,7 @@ static int examine(const Run *run, Py_ssize_t begin, Py_ssize_t *end, Row **row)
         return OTHER;
     int length = at[1];
     *end = begin + header + length + 2 + (!is_v1 && at[2] ? SIGNATURE : 0);
-    *row = find_row((Table *)run->table, is_v1 ? at[5] : (uint32_t)little_endian(at + 7, 3));
+    *row = find_row((Table *)run->table, message_id_of(at));
     if (*row == NULL || (is_v1 && (length < (*row)->base_length || length > (*row)->length)))
         return OTHER;
     if (*end > run->size)
@@ -638,19 +638,26 @@ static int examine(const Run *run, Py_ssize_t begin, Py_ssize_t *end, Row **row)
     return crc == u16(at + header + length) ? GOOD : OTHER;
 }
 
+/* Release what a call has returned. Return 0, or -1 after an error. */
+static int finish(PyObject *returned) {
+    Py_XDECREF(returned);
+    return returned == NULL ? -1 : 0;
+}
+
 /* Count a frame of the sender with this key. Return 0, or -1 after an error. */
 static int count_frame(Run *run, long key, int sequence) {
     Framer *self = (Framer *)run->framer;
-    if (self->last_key == NULL || self->last_key_number != key) {
-        Py_CLEAR(self->last_key);
-        self->last_key_number = key;
-        if ((self->last_key = PyLong_FromLong(key)) == NULL)
+    PyObject **object = &self->keys[(key ^ key >> 8) % KEYS];
+    int result = 0;
+    if (*object == NULL || PyLong_AsLong(*object) != key) {
+        Py_XDECREF(*object);
+        if ((*object = PyLong_FromLong(key)) == NULL)
             return -1;
     }
-    PyObject *source = PyDict_GetItemWithError(run->sources, self->last_key), *done = Py_None;
+    PyObject *source = PyDict_GetItemWithError(run->sources, *object);
     Py_XINCREF(source);
     if (source == NULL && !PyErr_Occurred())
-        source = PyObject_CallMethod(run->framer, "_add_source", "liO", key, sequence, run->now);
+        source = PyObject_CallMethod(run->framer, "_add_source", "OiO", *object, sequence, run->now);
     if (source != NULL && Py_TYPE(source) != run->state->classes[SOURCE]) {
         PyErr_SetString(PyExc_TypeError, "the counters of a sender must be SourceStatistics");
         Py_CLEAR(source);
@@ -661,12 +668,11 @@ static int count_frame(Run *run, long key, int sequence) {
         ((Number *)source)->number++;
     else {
         self->is_out_of_order = 1;
-        done = PyObject_CallMethod(run->framer, "_count_out_of_order", "OliOn", source, key, sequence, run->now,
-                                   PyList_Size(run->frames));
-        Py_XDECREF(done);
+        result = finish(PyObject_CallMethod(run->framer, "_count_out_of_order", "OliOn", source, key, sequence,
+                                            run->now, PyList_Size(run->frames)));
     }
     Py_DECREF(source);
-    return done == NULL ? -1 : 0;
+    return result;
 }
 
 /* Count a valid frame, and add it to ``frames`` if it is wanted. Return 0, or -1 after an error. */
@@ -731,7 +737,7 @@ static int receive(Run *run) {
 static int begin_run(Run *run, PyObject *data) {
     Framer *self = (Framer *)run->framer;
     int is_ready = run->state->classes[FRAME] != NULL;
-    for (PyObject **member = &self->wanted; member < &self->last_key; member++)
+    for (PyObject **member = &self->wanted; member < self->keys; member++)
         is_ready = is_ready && *member != NULL;
     if (!is_ready || !PyBytes_CheckExact(self->rest) || !PyDict_Check(self->sources) ||
         Py_TYPE(self->table) != run->state->types[TABLE] ||
@@ -749,9 +755,7 @@ static int begin_run(Run *run, PyObject *data) {
         return -1;
     ((Number *)self->statistics)->number += (unsigned long long)PyBytes_Size(run->data);
     if (self->is_out_of_order) { /* the last call may have filled `late` and `foreign` */
-        PyObject *done = PyObject_CallMethod(run->framer, "_clear_out_of_order", NULL);
-        Py_XDECREF(done);
-        if (done == NULL)
+        if (finish(PyObject_CallMethod(run->framer, "_clear_out_of_order", NULL)) < 0)
             return -1;
         self->is_out_of_order = 0;
     }
@@ -760,8 +764,7 @@ static int begin_run(Run *run, PyObject *data) {
         run->is_simple = self->is_simple;
         PyObject *joined = self->rest;
         self->rest = PyBytes_FromStringAndSize(NULL, 0);
-        PyBytes_Concat(&joined, run->data);
-        Py_DECREF(run->data);
+        PyBytes_ConcatAndDel(&joined, run->data);
         run->data = joined;
         if (self->rest == NULL || joined == NULL)
             return -1;
@@ -784,11 +787,8 @@ static PyObject *framer_receive(PyObject *self, PyTypeObject *type, PyObject *co
     int result = begin_run(&run, args[0]);
     if (result == 0)
         result = receive(&run);
-    if (result == 0 && ((Framer *)self)->is_out_of_order) {
-        PyObject *done = PyObject_CallMethod(self, "_sort_out_of_order", "O", run.frames);
-        result = done == NULL ? -1 : 0;
-        Py_XDECREF(done);
-    }
+    if (result == 0 && ((Framer *)self)->is_out_of_order)
+        result = finish(PyObject_CallMethod(self, "_sort_out_of_order", "O", run.frames));
     PyObject *frames = result == 0 ? new_reference(run.frames) : NULL;
     clear_all(&run.data, 6);
     return frames;
