@@ -219,7 +219,7 @@ class StateCell(Generic[T]):
 
     def set(self, value: T, source: Source) -> None:
         """Store a new value and wake the waiters."""
-        if not self._known or value != self._latest:
+        if not self._known or (value is not self._latest and value != self._latest):
             self._changes += 1
         self._latest = value
         self._known = True

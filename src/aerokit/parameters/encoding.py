@@ -51,10 +51,7 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
 
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
     """Return the value in a message; a fraction or NaN that a vehicle sends for an integer type remains a float."""
-    type_ = ParameterType.from_wire(message.param_type)
-    if bytewise and type_ in _FORMATS:
-        return int(_FORMATS[type_].unpack_from(_exact_bits(message))[0])
-    return _cast(message.param_value, type_)
+    return _value_of(message, ParameterType.from_wire(message.param_type), bytewise)
 
 
 def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
@@ -64,7 +61,7 @@ def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
     """
     index = None if message.param_index == UNKNOWN_INDEX else message.param_index
     type_ = ParameterType.from_wire(message.param_type)
-    return Parameter(message.param_id, value_of(message, bytewise), type_, default=None, index=index)
+    return Parameter(message.param_id, _value_of(message, type_, bytewise), type_, default=None, index=index)
 
 
 def set_message(
@@ -126,10 +123,11 @@ def _exact_bits(message: ParamSet | ParamValue) -> bytes:
     return message.received_frame.body[HEADER_LENGTH : HEADER_LENGTH + 4].ljust(4, b"\0")
 
 
-def _cast(number: float, type_: ParameterType) -> int | float:
-    """Convert a whole number to int if the type is an integer type."""
-    is_whole = math.isfinite(number) and number == int(number)
-    return int(number) if type_.is_integer and is_whole else number
+def _value_of(message: ParamSet | ParamValue, type_: ParameterType, bytewise: bool) -> int | float:
+    if bytewise and type_ in _FORMATS:
+        return int(_FORMATS[type_].unpack_from(_exact_bits(message))[0])
+    number = message.param_value
+    return int(number) if type_.is_integer and float(number).is_integer() else number
 
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,999}")

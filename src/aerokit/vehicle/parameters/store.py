@@ -131,7 +131,8 @@ class ParameterStore:
             return
         if message.param_id == HASH_NAME or not message.param_id:
             return  # The hash is sent like a parameter, but is not one.
-        received = parameter_of(message, self.bytewise)
+        bytewise = self.bytewise
+        received = parameter_of(message, bytewise)
         name, old = received.name, self._known.get(received.name)
         if old is None and len(self._known) >= MAX_PARAMETERS:
             return  # A faulty vehicle may send new names without end.
@@ -141,7 +142,7 @@ class ParameterStore:
             self._read_later(name, stale.ignored_until)
             if same_value(received.value, stale.value):
                 return
-        new = received if old is None else merge_update(old, received, self.bytewise)
+        new = received if old is None else merge_update(old, received, bytewise)
         self._known[name] = new
         self._table = None
         self.updates += 1

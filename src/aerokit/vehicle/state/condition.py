@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
@@ -262,10 +263,15 @@ def estimator_health(message: messages.EstimatorStatus, context: Context) -> Est
 
 def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
     """Return the mission progress in MISSION_CURRENT."""
-    state = enum_member(MissionState, message.mission_state)
-    if message.total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the total.
+    return _mission_progress(message.seq, message.total, message.mission_state)
+
+
+@lru_cache(maxsize=16)  # The message is repeated, and always decoded when it arrives.
+def _mission_progress(seq: int, total: int, mission_state: int) -> MissionProgress:
+    state = enum_member(MissionState, mission_state)
+    if total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the total.
         return MissionProgress(current=None, total=None, state=state)
-    return MissionProgress(known(message.seq, unknown=U16), known(message.total, unknown=0), state)
+    return MissionProgress(known(seq, unknown=U16), known(total, unknown=0), state)
 
 
 def mission_reached(message: messages.MissionItemReached) -> int:
