@@ -19,21 +19,20 @@ WITH_BOTH = ("test_framer", "test_hostile_bytes", "test_encoder", "test_tlog", "
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     name = getattr(metafunc.module, "__name__", "")
     if name in WITH_BOTH:
-        metafunc.fixturenames.append("wire")
         python = exhaustive("python") if name == "test_recorded_traffic" else "python"
         rows = ["python"] if Framer is PythonFramer else ["c", python]  # built, and not AEROKIT_PURE=1?
-        metafunc.parametrize("wire", rows, indirect=True, scope="module")
+        metafunc.parametrize("implementation", rows, indirect=True, scope="module")
 
 
-@pytest.fixture(scope="module")
-def wire(request: pytest.FixtureRequest) -> Iterator[str]:
+@pytest.fixture(scope="module", autouse=True)  # Without autouse, pytest ignores the parameter.
+def implementation(request: pytest.FixtureRequest) -> Iterator[None]:
     """Replace the compiled code by the Python code if the parameter is "python"."""
     with pytest.MonkeyPatch.context() as patch:
-        if request.param == "python":
+        if getattr(request, "param", "c") == "python":
             patch.setattr(encoder.FrameEncoder, "_encode_frame", None)
             patch.setattr(encoder, "x25", x25_in_python())
             patch.setattr(tlog, "_compiled", None)
             patch.setattr(STANDARD, "decode", MethodType(Dialect.decode, STANDARD))
             for module in (request.module, framer_harness):
                 patch.setattr(module, "Framer", PythonFramer, raising=False)
-        yield request.param
+        yield

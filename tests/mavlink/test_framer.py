@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 
 from aerokit.mavlink import STANDARD, Dialect, FrameEncoder, Framer, Message, messages
 from aerokit.mavlink.frame import is_whole_frame
+from aerokit.mavlink.framer import PythonFramer
 
 HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
 ATTITUDE = messages.Attitude(1000, 0.25, 0.5, 0.75, -1.25, -1.5, -1.75)
@@ -398,6 +399,10 @@ def test_reordered_frames_are_not_lost(order: list[int]) -> None:
     assert (received, lost) == (11, 0)
 
 
+def test_python_parameter_selects_python_framer(request: pytest.FixtureRequest) -> None:
+    assert (Framer is PythonFramer) == (request.node.callspec.params["implementation"] == "python")
+
+
 def test_senders_are_counted_apart() -> None:
     framer = Framer()
     stream = [frame_of(HEARTBEAT, sequence=i, system_id=s) for i in (0, 1, 3) for s in (1, 2)]
@@ -408,6 +413,14 @@ def test_senders_are_counted_apart() -> None:
     assert framer.statistics.sources[1, 1].loss == pytest.approx(0.25)
     assert repr(framer.statistics.sources[2, 1]) == "<2/1: 3 received, 1 lost>"
     assert "frames=6" in repr(framer.statistics)
+
+
+def test_many_alternating_senders_are_counted_apart() -> None:
+    """The compiled framer keeps the keys of a few senders, so some of these replace each other there."""
+    framer = Framer()
+    feed(framer, [frame_of(HEARTBEAT, sequence=i, system_id=s) for i in (0, 1, 2) for s in range(1, 100)])
+    counted = {key: (source.received, source.lost) for key, source in framer.statistics.sources.items()}
+    assert counted == {(system_id, 1): (3, 0) for system_id in range(1, 100)}
 
 
 @pytest.mark.parametrize(
