@@ -61,7 +61,7 @@ def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
     """
     index = None if message.param_index == UNKNOWN_INDEX else message.param_index
     type_ = ParameterType.from_wire(message.param_type)
-    return Parameter(message.param_id, _value_of(message, type_, bytewise), type_, default=None, index=index)
+    return Parameter(message.param_id, _value_of(message, type_, bytewise), type_, None, index)
 
 
 def set_message(
