@@ -336,7 +336,7 @@ class Changes(AsyncIterator[T]):
             return
         if asyncio._get_running_loop() is self._loop:
             self._cell._remove_iterator()
-        else:  # In the blocking API, or if the collector runs on another thread.
+        else:  # The garbage collector may run on any thread.
             with suppress(RuntimeError):  # The event loop may be closed.
                 self._loop.call_soon_threadsafe(self._cell._remove_iterator)
 

@@ -303,7 +303,7 @@ class FrameReceiver:
             self._routes.record_duplicate_sender(frame)
             if is_foreign:
                 return True
-        # A heartbeat is dropped on mere suspicion, other frames only if two senders are proved.
+        # The frame may be from a second sender, but this is not certain, so only heartbeats are dropped.
         return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_outdated(frame))
 
     def _record_heartbeat(self, frame: Frame, framer: Framer, peer: Peer) -> None:

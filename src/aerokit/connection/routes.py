@@ -47,7 +47,7 @@ class OtherPeer:
         self._expected: int | None = None  # next sequence number of the owner when this peer began to send
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
-        # Number of the peer's frames since the owner's last frame, and the time of the first of them.
+        # Number of frames since the last frame from the route's own peer, and the time of the first of them.
         self._frames, self._began_at = 0, 0.0
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
@@ -57,7 +57,7 @@ class OtherPeer:
 
         ``expected`` is the owner's next sequence number, which changes with each frame of the owner.
         """
-        if expected != self._expected:  # The owner has sent frames since the last call, so the comparison starts again.
+        if expected != self._expected:  # The owner has sent frames since the last call.
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
@@ -285,8 +285,7 @@ class Routes:
         if expected_ms is not None:
             clock_matches = _boot_time_matches(frame, expected_ms, silent_s)
         else:
-            # The unknown clock of the owner counts as matching, so that the sequence numbers alone decide. If they are
-            # unknown, too, the result is unknown.
+            # Without a time since boot from the route's present peer, the sequence numbers alone decide.
             clock_matches = None if sequence_matches is None else True
         expected = 0 if route.counters is None else route.counters.expected
         other.add(frame, expected, sequence_matches, clock_matches)
@@ -297,7 +296,7 @@ class Routes:
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        # The other peers were compared with the old owner, so these comparisons are dropped.
+        # Forget the comparisons of other peers with the previous peer of this route.
         self._other_peers = {
             (component, peer): other for (component, peer), other in self._other_peers.items() if component != source
         }
@@ -338,7 +337,8 @@ def _sequence_matches(frame: Frame, route: _Route, silent_s: float) -> bool | No
     """Return True if a frame could be the next one of the route's owner by its sequence number. None if unknown."""
     if route.counters is None:
         return None
-    # The owner's latest frames may be lost. We allow for 1.5 times its rate since its last heartbeat, plus 8.
+    # The number may be ahead of the expected one by the frames that were sent, but lost, since the last heartbeat: at
+    # most 1.5 times those at the usual rate, plus 8.
     max_ahead = 8 + 1.5 * route.rate * silent_s
     # With a larger range, more than half of the 256 sequence numbers would match by chance.
     return (frame.sequence - route.counters.expected) & 0xFF <= max_ahead if max_ahead < 128 else None

@@ -42,7 +42,6 @@ class SignatureFilter:
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # last logged error of writing the file of ``Signing(keep=…)``
-        # The owner calls `set_signing`, which sets the actual value, before the first frame.
         self.admits_all: bool = True
         """True while no frame needs a check."""
         self.on_change: Callable[[], object] = lambda: None

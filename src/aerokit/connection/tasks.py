@@ -105,7 +105,7 @@ class Cancellation:
     """
 
     def __init__(self) -> None:
-        self._scope: anyio.CancelScope | None = None  # None before the block is entered
+        self._scope: anyio.CancelScope | None = None  # None before `__aenter__`
         self._is_cancelled = False
 
     def cancel(self) -> None:

@@ -1,4 +1,4 @@
-"""``ClassicConnection``: an open connection with the threads of the classic API, and its background calls."""
+"""``ClassicConnection``: an open connection, with its threads and the calls that run in the background."""
 
 from __future__ import annotations
 

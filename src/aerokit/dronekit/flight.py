@@ -209,7 +209,7 @@ class FlightMethods(VehicleAttributes):
         if modes and self._flightmode not in map(str, modes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
-            return  # The speeds are not sent either, because they would change the flight of the present mode.
+            return  # Do not send the speeds: they would change the flight in the present mode.
         self._dk.order("goto", flight_orders.go_to, aio, target)
         if airspeed is not None:
             self.airspeed = airspeed

@@ -256,7 +256,7 @@ class CurrentCommand:
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))  # once, as in DroneKit
         current, sent_at = aio.telemetry.mission_current, aio.connection.now()
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
-            # An earlier report of this number confirms nothing.
+            # A report of this number from before the message does not confirm it.
             await current.wait_until(lambda progress: progress.current == seq and current.updated_at > sent_at)
             return
         # MISSION_SET_CURRENT was not confirmed in time, so send a command instead, which the vehicle acknowledges.

@@ -124,7 +124,7 @@ class ListenerThread:
                 return
             try:
                 function(*args)
-            except BaseException:  # SystemExit, too, would end only this thread, not the program.
+            except BaseException:  # SystemExit would end only this thread, not the program.
                 logger.exception("Exception in a callback")
             self.on_called()
             del function, args  # Without this, the thread would keep them alive until the next call.

@@ -173,7 +173,7 @@ class MAVConnection(ClassicConnection):
         for listener in tuple(listeners):
             try:
                 listener(self, *args)
-            except BaseException:  # SystemExit, too, would only end the listener thread.
+            except BaseException:  # SystemExit would only end the listener thread.
                 logger.exception("Exception in a listener of the connection")
 
     def write_frame(self, frame: Frame) -> None:

@@ -110,7 +110,7 @@ class Listeners:
             for listener in self.by_name.get(name, ()):
                 try:
                     listener(self._owner, attr_name, value)
-                except BaseException:  # SystemExit, too, would only end the listener thread.
+                except BaseException:  # SystemExit would only end the listener thread.
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _update_kept_owner(self) -> None:

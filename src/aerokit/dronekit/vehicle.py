@@ -426,7 +426,7 @@ def connect(
     except BaseException as error:
         handler.close()
         if isinstance(error, KeyboardInterrupt) and vehicle_class is None:
-            # After Ctrl-C, frames of this package do not help the user either.
+            # After Ctrl-C, a traceback through this package would not help the user.
             raise error.with_traceback(None) from error.__cause__
         raise
     return vehicle

@@ -152,7 +152,7 @@ class Attachment:
     def _receive(self, data: bytes, peer: Peer) -> None:
         try:
             now = self._now()
-            # Frames of our own program come without a socket, and therefore have not waited.
+            # Frames of a SharedLink have not waited in a socket.
             arrived_at = now if self._is_shared else self._switch.arrival(now)
             port_peer = None if self._has_single_peer else peer
             framer = self._peers.framers.get(port_peer)

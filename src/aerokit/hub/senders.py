@@ -1,4 +1,4 @@
-"""Senders known to a hub, the frames received recently, and the guard against duplicate senders on one endpoint."""
+"""Senders and recent frames of a hub, and ``IdentityGuard``, which drops frames with another peer's ids."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ class IdentityGuard:
     def _publish(self, event: Event) -> None:
         if isinstance(event, RouteChanged):
             ids = event.system_id, event.component_id
-            self._reported_at.pop(ids, None)  # The former owner may be the next duplicate, which must be reported.
+            self._reported_at.pop(ids, None)  # If the previous peer goes on sending, that is reported at once.
             text = f"messages for {event.system_id}/{event.component_id} are sent here now, no longer to {event.before}"
             self._report("route_changed", self._current_peer, text)
         elif isinstance(event, DuplicateSender):

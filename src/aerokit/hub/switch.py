@@ -66,8 +66,8 @@ class Switch:
 
     def unix_time(self) -> float:
         """Return the time in seconds since 1970. It never jumps."""
-        # A later correction of the system time has no effect. This does no harm, because `Signing` uses the newest
-        # received stamp if that is later.
+        # Later corrections of the system time are ignored. This does no harm, because `Signing` uses the newest
+        # received time stamp if that is later.
         return self._unix_epoch_s + self._clock()
 
     def add(self, port: Port) -> None:
@@ -196,7 +196,7 @@ class Switch:
         if len(plans) > 1 and not (len(data) <= MAX_JOINED_BYTES and all(out.joins_frames for out in outs)):
             return False
         for out in outs:
-            if not out.batch and out.must_queue():  # A queue contains single frames.
+            if not out.batch and out.must_queue():  # A full port queues frames one by one.
                 return False
         for out in outs:
             if not out.batch:

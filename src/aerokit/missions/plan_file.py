@@ -295,7 +295,7 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
     mission = document.setdefault("mission", {})
     if not mission:
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
-        old = None  # There is nothing to keep.
+        old = None  # The document has no mission whose members could be kept.
     if old is None or plan.mission.items != old.mission.items:
         groups = read_entries(JsonValue(mission["items"], "plan", "mission.items").elements())
         mission["items"] = merged_entries(mission["items"], groups, plan.mission.items)

@@ -136,14 +136,14 @@ FILES = {name: Path(__file__).with_name(f"{name}.py") for name in ("twins", "fle
 # Base classes of twins whose type parameter is the asynchronous class, such as ``TwinOf[Vehicle]``.
 GENERIC_BASES = ("TwinOf", "BlockTwin", "SelectionTwin")
 
-# Maps each generated file (page) to the asynchronous functions that open a context, such as ``connect``.
+# Maps each generated file to the functions whose result is entered by ``async with``, such as ``connect``.
 FUNCTIONS: dict[str, tuple[str, ...]] = {
     "twins": ("aerokit.connection.opening.open_connection", "aerokit.vehicle.connect.connect"),
     "fleet_twins": ("aerokit.fleets.opening.fleet",),
     "component_twins": ("aerokit.onboard.opening.component",),
 }
 
-# Maps each page to the hand-written function (module and name) that opens such a context on a loop thread.
+# Maps each generated file to the module and the function that enter these ``async with`` blocks on a loop thread.
 OPENERS = {
     "twins": ("aerokit.sync.blocks", "opened"),
     "fleet_twins": ("aerokit.sync.fleet_blocks", "opened_fleet"),
@@ -215,10 +215,9 @@ class Page:
             self.for_types.add(origin)
 
     def import_literals_in(self, node: ast.AST | None, module: str) -> None:
-        """Import the Literals of an annotation at run time, because the decorator ``checked`` needs their values."""
+        """Import the Literals of an annotation at run time, because ``checked`` needs their values."""
         if node is None:
             return
-        # Classes need no import at run time, because `checked` knows them by their names.
         for part in ast.walk(node):
             if not isinstance(part, ast.Name):
                 continue

@@ -404,7 +404,7 @@ class _Call(ThreadFuture[T]):
                 self.set_result(await self._function())
             except asyncio.CancelledError:
                 raise
-            except BaseException as error:  # SystemExit, too, must be raised in the caller's thread, not in the loop's.
+            except BaseException as error:  # Even SystemExit must be raised in the caller's thread, not in the loop's.
                 self.set_exception(error)
 
 

@@ -187,7 +187,7 @@ class MultiLink(Link):
             opening.cancel()
         try:
             await asyncio.wait(openings)
-        finally:  # The caller may be cancelled in wait(), because anyio cancels each await.
+        finally:  # In a cancelled anyio scope, wait() raises at once.
             for link in self._own_links:
                 link.close()
             for member in self._members:

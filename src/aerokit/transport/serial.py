@@ -200,7 +200,7 @@ class _SerialProtocol(asyncio.Protocol):
             with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._link._loop.call_soon(self._link._outbox.resume)
 
-    # The methods of `_replace_port_methods` report their errors themselves. This method gets all other errors.
+    # Errors of read and write do not arrive here: `_replace_port_methods` reports them.
     def connection_lost(self, exc: Exception | None) -> None:
         self._link._lose(f"the device failed: {exc}", exc)
 

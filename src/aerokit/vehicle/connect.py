@@ -374,7 +374,7 @@ async def vehicles_on(
                 try:
                     if on_found is not None:
                         on_found(vehicle)
-                except Exception:  # All vehicles stay connected.
+                except Exception:  # An error in the program's callback does not disconnect the vehicle.
                     logger.exception("on_found failed for vehicle %d", system_id)
                 await asyncio.Event().wait()  # This event is never set: `vehicles_on` cancels the task at its end.
         except AerokitError as error:

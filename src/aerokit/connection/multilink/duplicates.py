@@ -169,8 +169,8 @@ class MergedStreams:
             return False
         choice = self._choices.get(frame.system_id)
         # Equal frames with a time since boot prove that their links lead to one vehicle. Other frames, such as
-        # heartbeats, may be equal although they come from two vehicles. Frames that the signature check refused prove
-        # nothing, because any sender can send them over two links.
+        # heartbeats, may be equal although they come from two vehicles. Frames that the signature check refused do not
+        # count, because any sender can send them over two links.
         if choice is not None and boot_time_ms(frame) and self.copies.current.is_admitted:
             self._record_copy(choice, link, frame.received_at)
         if not self.copies.current.is_delivered:
@@ -185,8 +185,8 @@ class MergedStreams:
         if used is None or used.is_other_hardware or not frame.has_arrived_from_owner_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # A copy over the link in use counts for every link with an earlier copy. A copy over another link counts
-            # for that link and for the link in use.
+            # The copy counts for the link over which it arrived and for the link in use. If these are the same, it
+            # counts for every link with an earlier copy.
             is_new = link == used.link or candidate.link in (link, used.link)
             if is_new and frame.has_arrived_from_owner_over(candidate.link):
                 candidate.record_copy(now)

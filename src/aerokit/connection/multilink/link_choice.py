@@ -55,7 +55,7 @@ class Candidate:
         self.hardware: HardwareId | None = None
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
-        """True if :attr:`hardware` is another vehicle's id. A matching clock or copies then prove nothing."""
+        """True if :attr:`hardware` is another vehicle's id. A matching clock or copies then do not count."""
         # Numbers of requests for the hardware id, and of TIMESYNC answers since the first request.
         self._hardware_requests = self._answers_since_request = 0
         # How often the clock matched and did not match in succession, and number of copies. A reboot resets them.
@@ -83,7 +83,7 @@ class Candidate:
     def record_clock(self, matches: bool, *, awaits_hardware: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        With ``awaits_hardware``, matches prove nothing yet, because the link's hardware id is still awaited.
+        With ``awaits_hardware``, matches do not count yet, because the link's hardware id is still awaited.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
@@ -254,8 +254,8 @@ class LinkChoice:
             self._hardware_link = link
             for candidate in self.candidates.values():
                 candidate.on_reboot()
-        elif not self.clock.is_steady:
-            # The clock was paused for a moment, so earlier mismatches of other links prove nothing.
+        elif self.clock.was_paused:
+            # During the pause of a simulation, its answers over other links did not match the expected clock.
             for candidate in self.candidates.values():
                 candidate.reset_mismatches()
 

@@ -220,7 +220,7 @@ class MultiLinkRoutes:
     def is_duplicate(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
         """Return True if this frame was already delivered over another link, or has our own ids.
 
-        ``is_other_peer`` is the result of `arrived_on_other_peer`.
+        With ``is_other_peer``, its sender's messages go to another peer of this link (`arrived_on_other_peer`).
         """
         # PX4 forwards our heartbeats from one of its ports to the others, so they come back over another link.
         if (frame.system_id, frame.component_id) == self._own_source:
@@ -228,9 +228,9 @@ class MultiLinkRoutes:
         link = _link_index(peer)
         if not self._merged.is_duplicate(frame, link, is_other_peer=is_other_peer):
             return False
-        if is_other_peer:  # A second sender's copy proves nothing, because commands over this link go to the first.
+        if is_other_peer:  # It does not show which vehicle gets our messages over this link.
             return True
-        # A copy is not delivered. It still proves that this link works, and which vehicle the link leads to.
+        # The copy is dropped, but it proves that this link works, and shows to which vehicle the link leads.
         self._probes.record_hardware(frame, link)
         if frame.message_id == m.Heartbeat.ID:
             counters = self._counters.get((frame.system_id, link), {}).get(frame.component_id)

@@ -40,8 +40,8 @@ class VehicleClock:
 
     def __init__(self) -> None:
         self._samples: deque[ClockSample] = deque(maxlen=MAX_SAMPLES)
-        self.is_steady: bool = True
-        """True if the last sample was as expected from the rate; False after a pause or reboot."""
+        self.was_paused: bool = False
+        """True if the last sample showed a pause of a simulation, or a change of its speed."""
         self._rate_before: float | None = None  # clock rate before the last pause or reboot
         self._interrupted_at = -math.inf  # time of the first sample after it, on our clock
 
@@ -49,8 +49,8 @@ class VehicleClock:
         """Add a sample from the link in use. Return False if the vehicle rebooted."""
         continues = not self._samples or self._continues(sample)
         is_unexpected = self._fits(sample) is False  # None: the rate is not known yet
-        self.is_steady = continues and not is_unexpected
-        if not self.is_steady:
+        self.was_paused = continues and is_unexpected
+        if is_unexpected or not continues:
             if (rate := self._measured_rate) is not None:
                 self._rate_before, self._interrupted_at = rate, sample.at
             self._samples.clear()  # A rate that is measured across a pause or reboot would be wrong.
@@ -60,7 +60,7 @@ class VehicleClock:
     def matches(self, sample: ClockSample) -> bool | None:
         """Return True if a sample from another link agrees with this clock. None means that this is unknown."""
         fits = self._fits(sample)
-        # Until the rate is measured, a mismatch proves nothing, because a simulation may run at any rate.
+        # Until the rate is measured, a mismatch is no evidence, because a simulation may run at any rate.
         if self._measured_rate is None and not fits:
             return None
         return fits

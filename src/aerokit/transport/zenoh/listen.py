@@ -166,7 +166,7 @@ class ZenohListen(NetworkLink):
             liveliness.declare_subscriber(keys.client_token(), on_liveliness, history=True),
             liveliness.declare_token(keys.server_token(self._freshness.epoch)),
         ]
-        if queue is self._queue:  # See `_find_conflict`.
+        if queue is self._queue:  # False if this opening was cancelled while the thread was working.
             self._publisher = publisher
             self._declared += declared
 
@@ -193,7 +193,8 @@ class ZenohListen(NetworkLink):
         if not self._freshness.is_fresh(stamp, now) or stamp is None:
             self._send_notices(name, client.refuse_late(data, now), stamp)
             return
-        # A duplicate or overtaken datagram gets no notice, because its first copy or a newer one was processed.
+        # Do not tell the client that a duplicate or overtaken datagram was refused: the first copy or a newer datagram
+        # was processed.
         if not self._freshness.is_new(name, stamp):
             return
         if stamp.mode == "take":

@@ -305,8 +305,8 @@ class _PolledCell:
 
     @property
     def pending(self) -> bool:
-        # The state value reads this property on every access, so `read_at` is the last time at which the program used
-        # the value. The result is always False, because no message waits to be decoded.
+        # The state cell reads this property on every access, so `read_at` is the last time at which the program used
+        # the cell. The camera's messages are decoded on arrival, so none is ever pending.
         self.read_at = self._now()
         return False
 

@@ -244,7 +244,7 @@ class PhotoInterval:
             try:
                 await self._begin(operation)
             except BaseException:
-                self._new_captures.__exit__()  # It does nothing if `_begin` has not entered the queue yet.
+                self._new_captures.__exit__()  # Does nothing if `_begin` has not entered it yet.
                 raise
         return self
 
@@ -336,7 +336,7 @@ class PhotoInterval:
         self._waiting = {first.index: first}
 
     def _guess_start(self, index: int) -> None:
-        self._is_start_guessed = self._next_index is None  # A corrected start is not corrected again.
+        self._is_start_guessed = self._next_index is None  # A guess is corrected only once.
         self._next_index = index
         self._waiting.clear()  # It may contain the capture with the corrupt index.
         self._newest_index = index - 1  # One less, so that `_add` accepts the capture as the newest one.
@@ -348,7 +348,7 @@ class PhotoInterval:
         elif self._next_index is not None and capture.index >= self._next_index:
             self._waiting[capture.index] = capture
             if capture.index > self._newest_index:
-                if self._delivered:  # A higher index than that of a delivered capture confirms the start.
+                if self._delivered:  # A second capture with a higher index confirms the guess.
                     self._is_start_guessed = False
                 self._set_newest(capture.index)
 

@@ -117,7 +117,7 @@ class CommandArbiter:
     def supersede(self, topics: Iterable[Topic]) -> None:
         topics = tuple(topics)
         self._ordered_since_disarmed.update(topics)
-        # This order is never sent. It only ends the posted orders about these topics, because it is newer.
+        # An order without commands, which ends the posted orders about these topics, because it is newer.
         self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
@@ -275,7 +275,7 @@ class CommandArbiter:
             is_done=is_done,
             slept_s=partial(self.slept_since, self._now()),
         )
-        if order.armed is None and armed is not None:  # If `order.armed` is set, `post` has done this already.
+        if order.armed is None and armed is not None:  # `post` has counted orders with `armed`.
             self._supersede_arming(armed)
             order.arm_command = self.arm_commands_sent
         self._sent.append(sent)
@@ -347,7 +347,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        # A raw command without modes may have changed the mode itself. A newer order is posted, and may be executed.
+        # After a takeover, the vehicle executes no order, unless it was posted later. A mode change after an order
+        # without modes may be the effect of this order.
         was_taken_over = order is not None and bool(order.takeover_reason) and bool(order.modes) and order.is_newest
         # A takeover does not undo an order to arm.
         return "arm" in topics if was_taken_over else bool(topics)
@@ -376,7 +377,7 @@ class CommandArbiter:
         change is confirmed.
         """
         change = next(self._order_numbers)
-        self._open_mode_changes += 1  # Blocks may overlap, because a new order may be given during a block.
+        self._open_mode_changes += 1  # A new order may begin another mode change before this one is confirmed.
         try:
             yield
         except CommandRejected:  # The vehicle has not changed the mode.
@@ -499,7 +500,7 @@ class CommandArbiter:
         was_armed_by_program = is_order_open or was_caused_by_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        # This order is never sent. It records a takeover or a failsafe after the arming.
+        # An order without commands, which exists only to record a takeover or a failsafe after the arming.
         self._arming_order = self._create_order(modes, ()) if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:

@@ -81,7 +81,7 @@ class BackgroundTask:
         if self._scope is None or self._done is None or not self._session.connection.is_open:
             return
         if within_s:
-            # A cancelled program leaves the block, too, so this wait is shielded from the cancellation.
+            # Shielded, because the `async with` block may be left by a cancellation.
             with anyio.CancelScope(shield=True), anyio.move_on_after(within_s):
                 await self._done.wait()
         if self._scope is not None:
@@ -342,7 +342,7 @@ class ArmCleanup:
         """Return False if the link ends before the vehicle arms."""
         armed, since = self._session.telemetry.armed, self._session.connection.now()
         try:
-            if was_armed:  # The order has an effect only after the vehicle has disarmed.
+            if was_armed:  # An armed vehicle ignores the order until it disarms.
                 await armed.wait_until(lambda value: not value, description="disarmed")
             await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
         except AerokitError as error:
@@ -385,7 +385,7 @@ class ArmCleanup:
         was_taken_over = order.takeover_reason or order.failsafe or not (mode_now == mode or was_ordered)
         if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
-        # After a late report or a takeover, the order counts as the cause only if the vehicle has accepted it.
+        # After a takeover or a late HEARTBEAT, only the acknowledgement shows that this order has armed the vehicle.
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)
         # A vehicle that was disarmed meanwhile and is armed again was armed by another party.

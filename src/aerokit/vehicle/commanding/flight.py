@@ -154,7 +154,7 @@ class FlightActions(VehicleBase):
         """Return a function that returns True once new messages report a climb."""
         started, landed = self.connection.now(), self.telemetry.landed_state
         if landed.latest == MavLandedState.TAKEOFF and landed.age <= POSITION_MAX_AGE_S:
-            return lambda: False  # A climb during an earlier take-off proves nothing.
+            return lambda: False  # The climb may be the effect of an earlier command.
         # Without a recent altitude, the climb is measured from the first one that is received.
         is_start_known = self._position.was_received_since(started - POSITION_MAX_AGE_S)
         start_m = self._position.altitude_amsl() if is_start_known else -math.inf
@@ -400,7 +400,7 @@ class ModeActions(VehicleBase):
         order = self._arbiter.current or self._arbiter.newest
         if order is None:
             return ""
-        if not order.has_lost_mode:  # Without a mode change, only a failsafe is a takeover.
+        if not order.has_lost_mode:  # The mode has not changed, so only a failsafe can be a takeover.
             return order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # or unknown
         awaits_heartbeat = self.telemetry.armed.updated_at < order.mode_lost_at

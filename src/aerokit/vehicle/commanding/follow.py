@@ -186,7 +186,7 @@ class FollowStream(SteeringStream[TargetState]):
         self._reading: Cancellation | None = None
         # Text that explains why the source of positions ended or failed; empty while it works.
         self._end_reason = ""
-        # Set when the block is entered: bearing from the target, course of the target, altitude of the follower.
+        # Set by `__aenter__`: bearing from the target, course of the target, altitude of the follower.
         self._bearing_deg = 0.0
         self._course_deg = 0.0
         self._own_altitude_m = 0.0
@@ -214,7 +214,7 @@ class FollowStream(SteeringStream[TargetState]):
             await anyio.sleep(min(remaining_s, POLL_INTERVAL_S))
         self._raise_if_stopped()
 
-    # ------------------------------------------------------------------------------- the block
+    # ------------------------------------------------------------------------- begin and end
 
     async def __aenter__(self) -> Self:
         """Wait for the first position of the target, and then begin the stream in the mode for set-points."""

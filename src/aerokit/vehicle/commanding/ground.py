@@ -106,7 +106,7 @@ class ImpactDetector:
             # The vehicle flies on, so it did not hit the ground.
             self._impact_m_s = None
             self._impact_altitude_m = None
-        # While the vehicle does not sink, its altitude is the one before the next descent.
+        # The next descent begins at the altitude of the last report without a descent.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
             self._top_m = self.current_altitude()
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S

@@ -45,7 +45,7 @@ SetpointT = TypeVar("SetpointT")
 # stream's rate, because a message may be lost, and after that only every REPEAT_INTERVAL_S seconds.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
-# Set-points that the autopilot executes with its own limits of acceleration. With these, a sudden stop is an impact.
+# Set-points that the autopilot executes with limited acceleration, so that only an impact stops the vehicle suddenly.
 BRAKED_BY_AUTOPILOT = (
     VelocitySetpoint,
     BodyVelocitySetpoint,
@@ -240,7 +240,7 @@ class SetpointStream(SteeringStream[SetpointT]):
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)
-        if isinstance(initial, BRAKED_BY_AUTOPILOT):  # Other set-points may stop the vehicle suddenly in the air.
+        if isinstance(initial, BRAKED_BY_AUTOPILOT):  # Others may stop it suddenly without an impact.
             self._impact = ImpactDetector(context.session.telemetry)
 
     def set(self, setpoint: SetpointT) -> None:

@@ -117,7 +117,6 @@ class _StreamMonitor:
     """Tracks whether streamed messages arrive, and sets ``must_request`` when the vehicle may have lost the request."""
 
     def __init__(self, session: VehicleSession, cleanup: ExitStack) -> None:
-        # Each request resets the two attributes.
         self.has_received = False
         self.must_request = asyncio.Event()
         self._system_id = session.system_id

@@ -127,8 +127,8 @@ class PostedOrder:
                 may_retry = error.result == MavResult.TEMPORARILY_REJECTED and attempts_left and not self.end
                 if may_retry and await self._is_valid_at_next_heartbeat(timeout):
                     continue
-                # Ignore the refusal if HEARTBEAT has reported an effect of the order. It must also report this mode,
-                # because the order may have several modes.
+                # Ignore the refusal if HEARTBEAT reports this mode. `is_confirmed` alone may be due to another mode of
+                # the order.
                 if not (self._order.is_confirmed and self._session.telemetry.is_in(mode)):
                     raise
             return

@@ -173,7 +173,7 @@ class OrderSender:
         # A command to arm is overruled by one to disarm, and the reverse.
         is_overruled = sent is not None and sent.end == SUPERSEDED and order.is_newest
         if is_overruled or self._arbiter.is_replaced(order):
-            # A command in progress is awaited for a while after the newer order, so its error may not name that order.
+            # The time-out may have ended the wait before the newer order did. The error then lacks this reason.
             return OperationRejected(str(error) if SUPERSEDED in str(error) else f"{error}; {SUPERSEDED}")
         return error
 

@@ -115,7 +115,7 @@ class StickStream(SteeringStream[StickInput]):
 
     @property
     def _needs_stream_before_mode(self) -> bool:
-        return True  # Without the initial positions, the mode would start with the transmitter's throttle.
+        return True  # Without stick positions, PX4 would start the mode with the transmitter's throttle.
 
     def _stream_mode(self) -> Mode:
         if self._rules is None:

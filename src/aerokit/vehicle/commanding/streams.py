@@ -80,13 +80,13 @@ class ValueStream(Generic[ValueT]):
         self._valid_for_s = valid_for_s
         # Maximum delay of a tick; a longer delay means that the event loop was blocked.
         self._max_lag_s = max_lag_s
-        # The latest value, its message (None before the block is entered), and the time at which it was supplied.
+        # The latest value, its message (None before `__aenter__`), and the time at which it was supplied.
         self._value = initial
         self._message: Message | None = None
         self._set_at = -math.inf
         # Calls `_tick`; None while nothing is sent.
         self._timer: asyncio.TimerHandle | None = None
-        # Set once the stream has stopped. The error is raised by the next call, or when the block is left.
+        # Set once the stream has stopped. The next call, or `__aexit__`, raises the error.
         self._stop_error: AerokitError | None = None
         self._has_raised_stop = False
         self._was_entered = False
@@ -358,7 +358,7 @@ class TakeoverCheck:
         self._next_mode = next_mode
         self._mode_before = telemetry.mode.latest
         self._order_before = context.arbiter.latest(STEERING)
-        # True if the vehicle may still change to a mode of this order, e.g. of the hold after an abandoned flight.
+        # True if the vehicle may still change to a mode of `_order_before`, e.g. of the hold after an abandoned flight.
         is_taken_over = self._order_before is not None and bool(self._order_before.takeover_reason)
         self._may_change_late = context.arbiter.mode_is_in_doubt and not is_taken_over
         take_off_mode = autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol)

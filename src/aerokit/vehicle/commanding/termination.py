@@ -61,7 +61,7 @@ class TerminationActions(VehicleBase):
         def is_terminated() -> bool:
             is_off = armed.latest is False or state.latest == MavState.FLIGHT_TERMINATION
             is_reported = is_off or any(map(self.telemetry.is_in, modes))
-            return is_reported and armed.updated_at > order.given_at  # HEARTBEAT reports all three.
+            return is_reported and armed.updated_at > order.given_at  # HEARTBEAT reports arming, state and mode.
 
         await await_progress(
             self._session,

@@ -200,8 +200,7 @@ class Settings:
                     listed = await transfers.run(exchange)
                     if self._reboots != reboots_before:
                         continue  # A part of the list is from before the reboot.
-                    # `listed` has the component's order. The values in `_known` take precedence, because `_store` has
-                    # recorded the messages during the download.
+                    # Keep the order of the list, but the values of messages that have arrived during the download.
                     self._known = {**listed, **self._known}
                     self._is_complete = True
                     break

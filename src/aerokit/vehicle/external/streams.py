@@ -112,7 +112,7 @@ class MeasurementStream(Generic[MeasurementT]):
         self._probe = probe
         self._period_s = 1 / rate_hz
         self._valid_for_s = valid_for_s
-        # Parameters that decide whether the vehicle uses the measurements, read when the block is entered.
+        # Parameters that decide whether the vehicle uses the measurements. `__aenter__` reads them.
         self._parameters: dict[str, float] = {}
         # The measurement to send at the end of the period.
         self._waiting: _EncodedMeasurement | None = None

@@ -54,7 +54,7 @@ class _ClosingSession(NamedTuple):
 @contextmanager
 def _limit(description: str, timeout: float | None, missing: MissingRanges) -> Iterator[None]:
     """Raise FileTimeout with the missing ranges if the block takes more than ``timeout`` seconds."""
-    # A TimeoutError that the block itself raises, for example because of the disk, is not changed.
+    # A TimeoutError that is raised inside the `with` block, for example by the disk, is passed on.
     with anyio.move_on_after(timeout) as scope:
         yield
     if scope.cancelled_caught:

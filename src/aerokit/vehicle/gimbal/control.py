@@ -258,14 +258,14 @@ class GimbalControl:
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
-        # Registered before the request, because the vehicle's block may end before the confirmation.
+        # Registered before the request, so that control is released even if the vehicle is closed before it confirms.
         self._detach_callbacks.append(orders.context.on_finish(self._finish))
         since = self._session.connection.now()
         try:
             await self._request_control()
             await self._await_confirmation(since)
         except (CommandRejected, NotSupported, BusyError):
-            # Control was not obtained. Another block may have ended meanwhile without releasing the same control.
+            # Control was not obtained, but another block may have left the release of the same control to this one.
             self._end()
             if self._control_request.must_release:
                 release.send_soon()
@@ -367,7 +367,7 @@ class GimbalControl:
     def _end(self) -> None:
         """Forget the control that this block has. Sends nothing."""
         self._is_ended = True
-        self._lost.set()  # Calls of `until_lost` end too.
+        self._lost.set()  # This ends all calls of `until_lost`.
         requests = self._orders.registry.control_requests
         if self._control_request in requests:
             requests.remove(self._control_request)

@@ -172,7 +172,7 @@ class GimbalDevice:
         self.failures: int = 0  # the latest GIMBAL_DEVICE_ERROR_FLAGS
         self.manager_information: GimbalManagerInformation | None = None
         self.device_information: GimbalDeviceInformation | None = None
-        # Open control blocks: at most one with primary and one with secondary control.
+        # Open `gimbal.control()` blocks: at most one with primary and one with secondary control.
         self.control_blocks: list[ControlBlock] = []
         # True once the program has requested the limits. Orders beyond the limits are then refused.
         self.checks_limits = False
@@ -294,7 +294,7 @@ class ControlRequest:
         self.manager_id: int = manager_id
         self.gimbal_id_param: int = gimbal_id_param
         self.is_primary: bool = is_primary
-        # True if another block with the same control has ended, and has left the release to the block of this request.
+        # True once another block that requested the same control has ended without releasing it (`leave_release_to`).
         self.must_release = False
 
     def is_released_with(self, other: ControlRequest) -> bool:
@@ -306,7 +306,7 @@ class ControlRequest:
     def leave_release_to(self, requests: Iterable[ControlRequest]) -> bool:
         """Let other blocks with the same control release it later. Return False if there are none."""
         shared = [request for request in requests if request is not self and request.is_released_with(self)]
-        # Releasing now would take the control from these blocks. They must release it when they end.
+        # A release now would take the control from the other blocks, which are still open.
         for request in shared:
             request.must_release = True
         return bool(shared)

@@ -189,7 +189,7 @@ class GimbalRegistry:
         if device_id > MAX_GIMBAL_NUMBER and device_id != sender:
             self._record_received(message)
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
-        else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
+        else:  # The gimbal is the sender, or attached to it. `_device_of` calls `_record_received`.
             device = self._device_of(message, device_id)
             # A status about the sender's own gimbal is as reliable as GIMBAL_MANAGER_INFORMATION.
             rank = max(rank, RANK_INFORMATION)

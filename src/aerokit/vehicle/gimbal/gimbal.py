@@ -215,7 +215,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
             failure = error
         device = orders.device
         is_placeholder = device.component_id == 0
-        if failure is None or not is_placeholder:  # The address of the gimbal is known.
+        if failure is None or not is_placeholder:  # Otherwise, the gimbal's component id is unknown.
             has_own_id = not is_placeholder and device.number == 0
             target = device.component_id if has_own_id else manager_id
             try:

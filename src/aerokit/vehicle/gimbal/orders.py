@@ -71,7 +71,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        # Until a gimbal reports its attitude, only the placeholder may have one, from an older mount message.
+        # The placeholder has the attitude from a mount message (older firmware), which does not name a gimbal.
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 
@@ -122,13 +122,13 @@ class GimbalOrders:
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command. If the manager denies it, claim control and send it again."""
         self.raise_if_taken()
-        self.claim_if_denied(command)  # An earlier command may have been denied.
+        self.claim_if_denied(command)  # The previous command of this kind may have been denied.
         try:
             await send()
         except CommandRejected:
             self.raise_if_taken()
             was_claimed = self.claim_if_denied(command)
-            if not was_claimed:  # The manager refused for another reason, or an open control block handles control.
+            if not was_claimed:  # Control was not the reason, or `gimbal.control()` claims it.
                 raise
             await send()
 
@@ -285,7 +285,7 @@ class GimbalOrders:
         Returns True if a claim was sent. Its answer is not awaited.
         """
         commands, manager_id = self.session.commands, self.manager_id
-        # An open control block has requested control itself, and reports if it loses control.
+        # An open `gimbal.control()` block has requested control itself, and reports if it loses control.
         if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
         commands.forget_result(command, manager_id)  # One denial must not lead to a second claim.

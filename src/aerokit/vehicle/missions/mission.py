@@ -133,7 +133,7 @@ class MissionEndDetector:
             return self._is_on_ground
         if self._ending is Ending.OTHER:
             return True
-        # The items are unknown. If they end with a landing or a return, the mode shows it a little later.
+        # The items are unknown. A final landing or return shows in the mode, but a little after the completion.
         return self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
@@ -163,9 +163,9 @@ class MissionEndDetector:
         fall = self.ground.fall()
         if fall:
             return f"{fall}, {self.describe()}"
-        if self.ground.is_reported_on_ground:  # It is not yet decided whether the vehicle has landed.
+        if self.ground.is_reported_on_ground:  # `has_ended` decides whether it has landed.
             return None
-        if self._completed_at is not None:  # The mission is complete, and `_has_stayed_complete` decides.
+        if self._completed_at is not None:  # The mission is complete: `has_ended` waits for END_GRACE_S.
             return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
@@ -183,8 +183,8 @@ class MissionEndDetector:
         return f"the vehicle is not flying its mission but is in {session.telemetry.mode_name}"
 
     def _is_interruption_final(self) -> bool:
-        # The mode also changes at the end of the mission, which may be reported a little later than the mode. Another
-        # mode is therefore a failure only after END_GRACE_S and a MISSION_CURRENT.
+        # A mission that ends also changes the mode, and may report its end a little later. Another mode is therefore a
+        # failure only after END_GRACE_S and a MISSION_CURRENT.
         now = self._session.connection.now()
         if self._interrupted_at is None:
             self._interrupted_at = now
@@ -472,7 +472,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 if order.is_newest:
                     reported = self._tracker.current
                     with anyio.move_on_after(END_GRACE_S):
-                        # An earlier report confirms nothing.
+                        # A report from before the order does not confirm it.
                         await reported.wait_until(lambda now: now == item and reported.updated_at > order.given_at)
                         return
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
@@ -511,7 +511,7 @@ class MissionControl(VehiclePlan["Mission"]):
             # After a landing, the HEARTBEAT that reports the mode may also report that the vehicle has disarmed.
             if self._session.telemetry.is_confirmed_disarmed:
                 raise OperationRejected("the mission was not started: the vehicle disarmed")
-            self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
+            self._tracker.discard_completion()  # Reports so far may be about the previous flight.
 
     def _is_over(self, acknowledged_at: float) -> bool:
         """Return True if PX4 has ended the mission before HEARTBEAT reported its mode, e.g. at the last waypoint."""

@@ -194,7 +194,7 @@ class PlanChannel:
             return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
         if is_partly_overwritten:
             return "; the vehicle now has some new and some old items: upload again, or clear"
-        if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT cuts a longer plan.
+        if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT removes further items.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
         return "; the vehicle still has its previous items"
 

@@ -322,7 +322,7 @@ class ParameterAccess:
             with self._raised_rate(raise_after_s):
                 answers = await transfers.run(exchange)
         finally:
-            # Answers to a write that was cancelled or failed may also arrive late.
+            # Recorded after a failed or cancelled write, too, because its answers may arrive late.
             self._written_at.update(dict.fromkeys(names, transfers.connection.now()))
         for name, answer in answers.items():
             if isinstance(answer, Parameter):

@@ -28,7 +28,7 @@ __all__ = ["TemporaryParameters", "Transaction"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# Leaving a block takes at most this many times ``idle_timeout_s``, even if the link is slow.
+# Parameters are restored for at most this many times ``idle_timeout_s``, even if the link is slow.
 MAX_RESTORE_TIMEOUTS = 3
 
 
@@ -107,7 +107,7 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # The answer may be a temporary value if another block did not wait and restored its parameters meanwhile.
+            # If another block has just restored the parameter, the answer may still be that block's temporary value.
             current[name] = self._registry.restored.get(name) or self._with_all_bits(answer)
             if name not in self._saved:
                 self._saved[name] = current[name]
@@ -157,14 +157,18 @@ class _Block:
         # If another block waits long for an answer, restore the values of this block without waiting for it.
         async with self._registry.exclusive(self._idle_timeout_s):
             saved = self._take_saved()
+            # Recorded before the write: a block that reads a temporary value meanwhile must save these values instead.
             self._registry.restored.update({param.name: param for param in saved})
             # A blocked event loop may have lengthened the wait. This must not use up the time to restore the values.
             waited_s = min(anyio.current_time() - began_at, self._idle_timeout_s)
             with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s - waited_s):
                 try:
-                    names = [param.name for param in saved if self._access.written.get(param.name) is not None]
-                    present = await self._access.read(names, self._idle_timeout_s)
+                    # Keep values that another station has changed. Without a confirmed write of ours (None), there is
+                    # no value to compare with.
+                    comparable = [param.name for param in saved if self._access.written.get(param.name) is not None]
+                    present = await self._access.read(comparable, self._idle_timeout_s)
                     saved = [param for param in saved if not self._was_changed(param.name, present.get(param.name))]
+                    # A parameter that cannot be read may have another station's value, so it is not overwritten.
                     unreadable = {name for name, answer in present.items() if not isinstance(answer, Parameter)}
                     to_write = [param for param in saved if param.name not in unreadable]
                     answers = await self._access.write(to_write, self._idle_timeout_s)

@@ -224,8 +224,7 @@ class CommandSender:
         key = (message.target_component or self._component_id, message.command)
         order_status, was_just_sent = options.order_status, options.was_just_sent
         self._abort_run_of_ended_order(key)
-        # A command is sent even if its order ended before this call, but not if the order ends during the wait for the
-        # lock.
+        # The caller has checked the order's state, so only an end during the wait for the lock prevents the command.
         earlier_end = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:

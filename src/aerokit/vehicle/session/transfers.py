@@ -121,7 +121,7 @@ class Transfers:
                         self._explain(answer)
             return result
         self._end.raise_if_ended()
-        raise AssertionError("the scope is cancelled only at the end")
+        raise AssertionError("the exchange was cancelled, but the session has not ended")
 
     def _explain(self, error: OperationTimeout) -> None:
         error.args = (f"{error}; {self._describe()}",)

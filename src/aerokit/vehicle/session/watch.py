@@ -296,7 +296,7 @@ class LinkWatch:
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Publish a report and call ``on_tick`` once a second, until the connection ends."""
         self.request_time()
-        self._next_request_at = self._connection.now()  # The next request follows after one second instead of two.
+        self._next_request_at = self._connection.now()  # The first tick sends the second request.
         while self._connection.is_open:
             started = self._connection.now()
             await anyio.sleep(REPORT_PERIOD_S)

@@ -231,7 +231,7 @@ class Telemetry(States):
         """Return the function that updates the cell of a state from one type of message."""
         cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
-        # A message in LAZY is decoded late, and must not replace a newer value from a message of another type.
+        # A message in LAZY is decoded when a cell is read. It must not replace a newer value from another message type.
         may_be_older = message_source.message in LAZY and len(field.sources) > 1
 
         def update(message: Any, source: Source) -> None:
