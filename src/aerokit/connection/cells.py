@@ -330,7 +330,7 @@ class Changes(AsyncIterator[T]):
         self._read_count = self._total() - (1 if cell.is_known else 0)
         self._missed = 0
 
-    # A reader may leave its loop at any time. Only garbage collection then shows that the iteration has ended.
+    # If a program leaves its loop by `break`, only garbage collection shows that the iteration has ended.
     def __del__(self) -> None:
         if not hasattr(self, "_cell"):  # __init__ raised.
             return

@@ -20,8 +20,8 @@ LATE_THRESHOLD_S = 0.08
 
 BLOCKED_THRESHOLD_S = 0.25
 
-# If nothing was read in this many loop iterations, all data that arrived during the pause has been read. A single
-# iteration would not prove it, because some loops run timers before they read sockets.
+# After a pause of the loop, all data that arrived meanwhile has been read once this many iterations read nothing. One
+# iteration does not suffice, because some loops run timers before they read sockets.
 MIN_IDLE_ITERATIONS = 3
 
 MAX_SLEEPS = 16
@@ -83,7 +83,7 @@ class LoopWatch:
         """Earliest possible receive time of data that is read now; infinite if the data cannot have waited."""
         # The last times at which the computer woke, with the seconds for which it was suspended.
         self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
-        # While catching up, the next time at which `arrival` checks for a suspension, which is slow.
+        # Next time at which `arrival` checks for a suspension. The check is slow.
         self._check_sleep_at = -math.inf
         self._has_read = False  # True if data was read since the last call of `_stop_catching_up_when_idle`
         self._idle_iterations = 0  # number of consecutive loop iterations in which nothing was read

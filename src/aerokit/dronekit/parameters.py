@@ -82,7 +82,7 @@ class ParameterDownload:
             await self._request(name)
             return
         async with anyio.create_task_group() as group:
-            # The request and the download run at the same time. The first that ends successfully cancels the other.
+            # Request the parameter during the download of all. The first that succeeds cancels the other.
 
             async def read() -> None:
                 if await self._request(name):

@@ -230,7 +230,7 @@ class Router(Generic[PortT]):
         elif self._is_copy(earlier, number, now, is_out_of_order=is_out_of_order):
             return self._duplicate
         elif self._is_echo(earlier, number, now):
-            # Too late for a copy: the frame returns in a slow loop, or equals an earlier one by chance, like the first
+            # This late frame is no copy: it returns in a slow loop, or equals the earlier one by chance, like the first
             # command of a restarted program. It is forwarded until several frames prove a loop.
             first_port, newest_port, _ = earlier
             if self._record_echo(ingress, source, first_port, now):

@@ -324,7 +324,7 @@ def altitude_and_frame(altitudes: Altitudes) -> tuple[float, MavFrame]:
 
 def action_item(command: int, *parameters: float, z: float = 0.0) -> MissionItem:
     """Create an item without a place."""
-    # PX4 requires the frame MISSION for such items.
+    # PX4 requires the frame MISSION for items without a place.
     return MissionItem(command, MavFrame.MISSION, *_four(parameters), z=z)
 
 

@@ -152,8 +152,8 @@ def pack_for_download(
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
-        # The last `unsplit_size` bytes of the entry must be in one block. For PX4, these are the value and its default.
-        # ArduPilot (``whole_defaults=False``) keeps only the last number whole (AP_Filesystem_Param.cpp).
+        # The last `unsplit_size` bytes of an entry must not be divided between two blocks: on PX4 the value and its
+        # default, on ArduPilot (``whole_defaults=False``) only the last number (AP_Filesystem_Param.cpp).
         unsplit_size = _FORMATS[code].size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
         if 0 < size_in_next_block < unsplit_size:

@@ -133,7 +133,7 @@ def render_docstring(text: str | None, indent: str = "        ") -> str:
 
 FILES = {name: Path(__file__).with_name(f"{name}.py") for name in ("twins", "fleet_twins", "component_twins")}
 
-# Base classes of twins whose type parameter is the asynchronous class, such as ``TwinOf[Vehicle]``.
+# Base classes of generated classes (twins) whose type parameter is the asynchronous class: ``TwinOf[Vehicle]``.
 GENERIC_BASES = ("TwinOf", "BlockTwin", "SelectionTwin")
 
 # Maps each generated file to the functions whose result is entered by ``async with``, such as ``connect``.

@@ -123,7 +123,7 @@ class LoopThread:
                 with contextlib.suppress(AerokitError):
                     self._start(call)
             if call is not None:
-                self._cancel(call)  # The functions of `run_shielded` shield their own clean-up.
+                self._cancel(call)  # With `is_shielded`, the function shields its own clean-up.
                 wait_s = SIGNAL_CHECK_INTERVAL_S if is_shielded else INTERRUPTED_CALL_TIMEOUT_S
                 while call.is_scheduled and not call.wait(wait_s):
                     must_wait_on = is_shielded and self._thread.is_alive()

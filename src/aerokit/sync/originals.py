@@ -58,7 +58,7 @@ def _names(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-# All twins. A twin comes after the twins that its members return.
+# All classes to generate (twins). A class comes after those that its members return.
 TWINS = (
     Twin(
         "aerokit.connection.cells.StateCell",

@@ -228,7 +228,7 @@ class MultiLinkRoutes:
         link = _link_index(peer)
         if not self._merged.is_duplicate(frame, link, is_other_peer=is_other_peer):
             return False
-        if is_other_peer:  # It does not show which vehicle gets our messages over this link.
+        if is_other_peer:  # Our messages over this link go to another peer.
             return True
         # The copy is dropped, but it proves that this link works, and shows to which vehicle the link leads.
         self._probes.record_hardware(frame, link)
@@ -282,7 +282,7 @@ class MultiLinkRoutes:
     def update(self, now: float) -> None:
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
-                # The counts come first, because they update `received_at`, which is too old after a blocked event loop.
+                # This updates `received_at`, which may be too old for the comparison below after a blocked event loop.
                 if counters := self._counters.get((system_id, link), {}).values():
                     received = sum(counter.received for counter in counters)
                     lost = sum(counter.lost for counter in counters)

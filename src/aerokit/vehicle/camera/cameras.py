@@ -269,7 +269,7 @@ class Cameras:
             # If the list is full, a new capture replaces the last one.
             del self._early_captures[MAX_EARLY_CAPTURES - 1 :]
             self._early_captures.append((message, capture))
-        else:  # The new object has missed this message.
+        else:  # `at` may create the camera now, after this message.
             self.at(number)._log.record(message, capture)
 
     def _process_early_captures(self) -> None:

@@ -258,7 +258,7 @@ class CameraLink(CameraOrders):
         def on_message(message: Any) -> None:
             frame = message.received_frame
             if frame is not None and frame.component_id == component_id and self._is_from_this_camera(message):
-                # An autopilot without a camera sends HEARTBEAT, and PX4 also STORAGE_INFORMATION about its own card.
+                # An autopilot without a camera also sends HEARTBEAT, and PX4 STORAGE_INFORMATION about its own card.
                 if message_type.NAME.startswith("CAMERA_"):
                     self._is_found.set()
                 callback(message)

@@ -69,7 +69,8 @@ class CommandArbiter:
         self.last_disarmed_report_at: float = -math.inf
         """Time of the last HEARTBEAT that reported disarmed."""
         self._last_arming_at = -math.inf  # time of the last change from disarmed to armed
-        # Records a takeover or a failsafe since the program armed the vehicle; None if another party has armed it.
+        # An order without commands, which records a takeover or a failsafe since the program armed the vehicle. None if
+        # another party has armed it.
         self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
@@ -141,7 +142,7 @@ class CommandArbiter:
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
-        if self._posted_modes():  # A posted order may change the mode later than this order does.
+        if self._posted_modes():  # A `post` block may change the mode later than this order does.
             self.doubt_mode()
         was_flown = self.is_flown_by_program
         if self.newest is not None:
@@ -153,7 +154,7 @@ class CommandArbiter:
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        # HEARTBEATs no longer update orders that have ended.
+        # Remove orders that have ended, so that HEARTBEATs no longer update them.
         self._orders = [active for active in self._orders if active.is_newest]
         for active in self._orders:  # A change to a mode of the new order is not a takeover.
             active.expect(modes, any_until=order.any_mode_until)
@@ -229,7 +230,7 @@ class CommandArbiter:
             self._notify_steering()
             arming_order = () if self._arming_order is None else (self._arming_order,)
             for previous in (*arming_order, *self._orders):
-                if ACTION not in previous.ending_topics:  # A change to a mode of the posted order is not a takeover.
+                if ACTION not in previous.ending_topics:  # A change to a mode of the new order is not a takeover.
                     previous.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
@@ -500,7 +501,6 @@ class CommandArbiter:
         was_armed_by_program = is_order_open or was_caused_by_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        # An order without commands, which exists only to record a takeover or a failsafe after the arming.
         self._arming_order = self._create_order(modes, ()) if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:

@@ -369,7 +369,7 @@ class ArmingActions(VehicleBase):
             except CommandRejected:
                 raise
             except (CommandTimeout, OperationRejected) as error:
-                # The reboot itself ends the wait for the acknowledgement.
+                # The reboot may have ended the order, and with it the wait for the acknowledgement.
                 if not order.was_sent:
                     raise
                 unanswered = error

@@ -130,7 +130,7 @@ class FlightCleanup:
     async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order the vehicle to hold, even if it already is in the hold mode."""
         order.only_stops = True
-        if self._holds_by_reposition:  # PX4 may be flying to a place in LOITER, its hold mode.
+        if self._holds_by_reposition:  # PX4 also flies to places in LOITER, its hold mode.
             # PX4 acts on the loss of set-points after 1 s (COM_OF_LOSS_T), so a lost hold is repeated earlier.
             await self._sender.send_long(
                 order, *STOP_HERE, attempt_timeout=HOLD_ACK_TIMEOUT_S, attempts=self._max_attempts

@@ -125,7 +125,7 @@ class Health:
 
     def _unnamed_reasons(self) -> list[str]:
         """Return reasons for failing checks that the vehicle does not explain: low batteries, else a general text."""
-        low_batteries = []  # PX4 sends its status text about a low battery only once.
+        low_batteries = []  # from BATTERY_STATUS, because PX4 sends its status text about a low battery only once
         for battery in self._telemetry.batteries.latest or ():
             # With these charge states (critical, emergency, failed, unhealthy), vehicles refuse to arm.
             if MavBatteryChargeState.CRITICAL <= battery.charge_state <= MavBatteryChargeState.UNHEALTHY:

@@ -358,7 +358,7 @@ class SentCommand:
         """Error text that explains why the command is not sent again; empty while it may be sent again."""
         if self.is_confirmed:
             return "its effect was reported"
-        if self._slept_s() > 0:  # Hours may have passed since the last transmission.
+        if self._slept_s() > 0:  # The computer has slept since the command was sent, perhaps for hours.
             return "the computer slept"
         return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
 

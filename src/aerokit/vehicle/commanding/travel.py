@@ -501,7 +501,7 @@ class LookActions(VehicleBase):
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:
-        # A takeover does not count, because a ROI applies in any mode.
+        # A takeover does not prevent the rest of the order, because a ROI applies in any mode.
         if order.end and not order.takeover_reason:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 

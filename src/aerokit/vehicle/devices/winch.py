@@ -117,8 +117,8 @@ class Winch(ReadOnly):
 
         def has_paid_out(status: m.WinchStatus) -> bool:
             nonlocal max_earlier_m
-            # A turning winch went on after `status_before`, until it got the command. That was before its first status
-            # after the acknowledgement, with which this function is called first.
+            # A turning winch went on turning until it got the command. The first call of this function follows the
+            # acknowledgement, so it limits the length.
             if max_earlier_m is None:
                 max_earlier_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
             earlier_m = status.line_length - length_m - status_before.line_length
