@@ -145,7 +145,7 @@ class LoopWatch:
         before = self._suspended_before
         self._suspended_before = max(before, self._suspended())
         slept_s = self._suspended_before - before
-        # On macOS, NTP may adjust only one of the two clocks, so they drift apart slowly.
+        # A small difference is no sleep: on macOS, NTP may adjust only one of the two clocks.
         if slept_s <= LATE_THRESHOLD_S:
             return False
         self._ran_at -= slept_s  # The loop's clock stood still during the sleep, in which data may have arrived.

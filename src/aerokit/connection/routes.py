@@ -204,7 +204,7 @@ class Routes:
         if route is not None:
             return (route.peer,)
         peers = {route.peer for (system, _), route in self._routes.items() if system == system_id}
-        # A second vehicle with the same system id would also execute the message.
+        # Leave out a second vehicle with the same system id, which would also execute the message.
         if len(peers) > 1:
             peers -= self._peers_of_duplicate_autopilots(system_id)
         return peers or EVERY_PEER

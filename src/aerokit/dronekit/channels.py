@@ -221,7 +221,7 @@ class ChannelsOverride(_ChannelDict):
     def _apply(self, overrides: dict[str, int]) -> None:
         """Replace all overrides. A value of 0 releases its channel."""
         active = {channel: value for channel, value in overrides.items() if value}
-        # Channels that were released earlier are released again, because that message may have been lost.
+        # Channels that were released earlier are released again, because the first message may have been lost.
         released = (self._released | self.keys()) - active.keys()
         self._send(active, released)  # This may raise, so the dict changes only afterwards.
         for channel in self.keys() - active.keys():

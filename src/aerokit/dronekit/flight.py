@@ -139,7 +139,7 @@ class FlightMethods(VehicleAttributes):
 
             def is_done() -> bool:
                 # While an opposite order is unfinished, HEARTBEAT may report the wanted state only because that order
-                # has had no effect yet. `order` must then be done, too.
+                # has had no effect yet. Then wait until `order` is done.
                 return self._dk_reports_armed(value) and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)

@@ -114,7 +114,7 @@ class Listeners:
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _update_kept_owner(self) -> None:
-        # Listeners get the owner as an argument, so they keep the owner alive even if the program has dropped it.
+        # Listeners get the owner (a vehicle or its part) as an argument, so the owner must live as long as they do.
         if self._thread is not None:
             self._thread.keep_alive(self, has_listeners=bool(self.by_name))
 

@@ -401,7 +401,7 @@ class Router(Generic[PortT]):
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None
         if target is not None:
-            # A message of a sender to itself would go to the port where it arrived. The caller removes that port.
+            # A sender's message to itself is not forwarded, because the caller removes the port where it arrived.
             return {ingress_number: None} if target is origin else dict.fromkeys(target.destinations)
         # A message for an unknown component goes to its whole system.
         members = [sender for sender in self._senders.values() if sender.system_id == system_id]

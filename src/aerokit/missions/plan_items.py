@@ -215,7 +215,7 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
     params = value["params"].elements(7)
     param1, param2, param3, param4, latitude, longitude, z = (param.number(null=True) for param in params)
     first_param, _, _, _, latitude_param, longitude_param, _ = params
-    if xy_scale(command, frame) == DEGREE_SCALE:  # These calls raise an error for coordinates out of range.
+    if xy_scale(command, frame) == DEGREE_SCALE:  # number() checks the range.
         latitude_param.number(-90, 90, null=True)
         longitude_param.number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:

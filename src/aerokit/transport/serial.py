@@ -84,7 +84,7 @@ class SerialLink(BaseLink):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
         self._outbox.record_discarded(discarded_bytes)
-        # It is unknown how many writes these bytes contain, so they count as one dropped write.
+        # The number of discarded writes is unknown, so they count as one.
         if discarded_bytes > 0:
             self._drop(1)
 

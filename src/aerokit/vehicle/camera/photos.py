@@ -336,7 +336,7 @@ class PhotoInterval:
         self._waiting = {first.index: first}
 
     def _guess_start(self, index: int) -> None:
-        self._is_start_guessed = self._next_index is None  # A guess is corrected only once.
+        self._is_start_guessed = self._next_index is None  # False once the guess was corrected.
         self._next_index = index
         self._waiting.clear()  # It may contain the capture with the corrupt index.
         self._newest_index = index - 1  # One less, so that `_add` accepts the capture as the newest one.

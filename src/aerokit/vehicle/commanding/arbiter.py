@@ -284,7 +284,7 @@ class CommandArbiter:
         try:
             yield sent
             # The block has not raised, so the vehicle has accepted the command.
-            order.was_refused = False  # This command may replace one that was refused as unsupported.
+            order.was_refused = False  # The order's previous command may have been refused as unsupported.
             self._record_accepted(armed)
         except CommandRejected:
             order.was_refused = True

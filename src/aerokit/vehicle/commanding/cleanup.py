@@ -229,7 +229,7 @@ class FlightCleanup:
         try:
             yield
         except OperationRejected:
-            if order.impact:  # The vehicle could climb again to the target of the order.
+            if order.impact:  # After an impact, the vehicle must not climb again to its target.
                 self.hold_in_background(order)
             raise
         finally:

@@ -239,7 +239,7 @@ class FollowStream(SteeringStream[TargetState]):
     def _start_reading(self) -> None:
         target = self._target
         if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
-            return  # These targets are read at each tick of the stream.
+            return  # Each tick of the stream reads the target.
         scope = Cancellation()
         self._reading = scope
 

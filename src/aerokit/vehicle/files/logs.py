@@ -219,7 +219,7 @@ class Logs:
                 self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
                 await anyio.sleep(ERASE_RETRY_INTERVAL_S)
                 count_before = len(remaining)
-                # Some boards do not answer while they erase.
+                # `idle_timeout_s` is long, because some boards do not answer while they erase.
                 remaining = _still_listed(remaining, await self._entries(idle_timeout_s))
                 now = self._transfers.connection.now()
                 if len(remaining) < count_before:

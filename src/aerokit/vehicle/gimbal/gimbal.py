@@ -215,7 +215,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
             failure = error
         device = orders.device
         is_placeholder = device.component_id == 0
-        if failure is None or not is_placeholder:  # Otherwise, the gimbal's component id is unknown.
+        if failure is None or not is_placeholder:  # The component id to ask is known.
             has_own_id = not is_placeholder and device.number == 0
             target = device.component_id if has_own_id else manager_id
             try:
@@ -226,7 +226,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
                     INFORMATION_TIMEOUT_S,
                 )
             except (CommandRejected, CommandTimeout):
-                pass  # Autopilots do not support this message for servo gimbals.
+                pass  # For a servo gimbal, autopilots do not send GIMBAL_DEVICE_INFORMATION.
         device = orders.device
         messages = (device.manager_information, device.device_information)
         if not any(map(_is_new, messages, before)):

@@ -273,7 +273,7 @@ class PlanTransfer(Generic[PlanT]):
         while True:
             changes = self._cache.changes
             received = await self._receive(method)
-            if self._cache.changes == changes:  # Otherwise, the items may be those of two plans.
+            if self._cache.changes == changes:  # No other station has changed the plan meanwhile.
                 self._cache.set(received.items, self._context.now(), received.opaque_id)
                 return received.items
 

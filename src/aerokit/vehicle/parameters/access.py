@@ -102,7 +102,7 @@ class ParameterAccess:
                 await self._download(method, idle_timeout_s, on_progress)
                 if cached_list is not None:
                     await cached_list.save()
-                if self.store.is_complete:  # Otherwise the vehicle has rebooted meanwhile.
+                if self.store.is_complete:  # False if the vehicle has rebooted meanwhile.
                     return self.store.table
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
@@ -446,7 +446,7 @@ class _CachedList:
         # Another hash means that a parameter changed during the download.
         if self._hash is not None and self._hash == await self._read_hash():
             key = await self._key()
-            if self._access.store.is_complete:  # Otherwise the vehicle has rebooted meanwhile.
+            if self._access.store.is_complete:  # False if the vehicle has rebooted meanwhile.
                 self._cache.save(key, self._hash, self._access.store.table)
 
     async def _key(self) -> str:

@@ -77,7 +77,7 @@ class NameResolver:
         normalized = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
         answers = await self._access.read(self._names_in_doubt(normalized.values()), idle_timeout_s)
-        # A reboot while names are read clears the store, and then further names are unknown.
+        # If the vehicle reboots meanwhile, the store is cleared, and parameters that were known must also be read.
         while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:
             answers |= await self._access.read(to_read, idle_timeout_s, probe=True)
         for requested, name in normalized.items():

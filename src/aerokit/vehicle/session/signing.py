@@ -62,7 +62,7 @@ def _check_vehicle(session: VehicleSession) -> None:
 def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, initial_timestamp=0)
-    # A receiver refuses a frame as replayed if its time stamp is not later than the last one. The vehicle continues
-    # from this time stamp, which is therefore a second ahead of our clock.
+    # The vehicle's time stamps continue from this one. It is a second ahead of our clock, because a receiver refuses a
+    # frame as replayed if its time stamp is not later than the last one.
     timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
     return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)
