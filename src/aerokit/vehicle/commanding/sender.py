@@ -103,7 +103,7 @@ class OrderSender:
             await self.await_recent_state(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
         if CHANGED_BY_COMMAND.get(command) == MOTION:
-            # PX4 ends a take-off or a mission by a change to HOLD, which is no effect of the command.
+            # PX4 ends a take-off or a mission by a change to HOLD, which does not confirm this command.
             late_modes = self._arbiter.late_modes()
             modes = () if self._is_taking_off else tuple(mode for mode in modes if mode not in late_modes)
         started, was_sent_before = self._session.connection.now(), order.was_sent

@@ -189,7 +189,7 @@ class GimbalRegistry:
         if device_id > MAX_GIMBAL_NUMBER and device_id != sender:
             self._record_received(message)
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
-        else:  # The gimbal is the sender, or attached to it. `_device_of` calls `_record_received`.
+        else:  # The gimbal is the sender, or attached to it.
             device = self._device_of(message, device_id)
             # A status about the sender's own gimbal is as reliable as GIMBAL_MANAGER_INFORMATION.
             rank = max(rank, RANK_INFORMATION)
@@ -217,6 +217,6 @@ class GimbalRegistry:
         return attitude.value.yaw_deg if attitude.age <= HEADING_MAX_AGE_S else None
 
     def _on_reboot(self) -> None:
-        # Control blocks and pending orders survive a reboot of the vehicle.
+        # `reset` keeps open `gimbal.control()` blocks and pending orders, which outlast a reboot of the vehicle.
         for device in (*self.devices.values(), self.placeholder):
             device.reset()

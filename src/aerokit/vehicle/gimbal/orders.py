@@ -122,13 +122,13 @@ class GimbalOrders:
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command. If the manager denies it, claim control and send it again."""
         self.raise_if_taken()
-        self.claim_if_denied(command)  # The previous command of this kind may have been denied.
+        self.claim_if_denied(command)  # The previous command of this type may have been denied for lack of control.
         try:
             await send()
         except CommandRejected:
             self.raise_if_taken()
             was_claimed = self.claim_if_denied(command)
-            if not was_claimed:  # Control was not the reason, or `gimbal.control()` claims it.
+            if not was_claimed:  # Control is not lacking, or `gimbal.control()` claims it.
                 raise
             await send()
 
