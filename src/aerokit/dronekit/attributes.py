@@ -126,7 +126,6 @@ class VehicleAttributes(VehicleCore):
         super().__init__(handler)
         core = self._dk
         self._location = Locations(self)
-        # Core.on() and Core.notify_on() return a `LatestMessage`.
         core.on(m.Heartbeat, self._dk_on_heartbeat)
         self._dk_position = core.notify_on(m.GlobalPositionInt, "velocity")
         self._dk_vfr_hud = core.notify_on(m.VfrHud, "heading", "airspeed", "groundspeed")

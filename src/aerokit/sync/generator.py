@@ -143,7 +143,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "component_twins": ("aerokit.onboard.opening.component",),
 }
 
-# Maps each generated file to the module and the function that enter these ``async with`` blocks on a loop thread.
+# Maps each generated file to the function (module, name) that makes a ``with`` block from an ``async with`` block.
 OPENERS = {
     "twins": ("aerokit.sync.blocks", "opened"),
     "fleet_twins": ("aerokit.sync.fleet_blocks", "opened_fleet"),

@@ -255,7 +255,7 @@ class LinkChoice:
             for candidate in self.candidates.values():
                 candidate.on_reboot()
         elif self.clock.was_paused:
-            # During the pause of a simulation, its answers over other links did not match the expected clock.
+            # While a simulation was paused, its answers over other links also mismatched. Forget these mismatches.
             for candidate in self.candidates.values():
                 candidate.reset_mismatches()
 

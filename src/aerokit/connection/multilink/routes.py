@@ -220,7 +220,7 @@ class MultiLinkRoutes:
     def is_duplicate(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
         """Return True if this frame was already delivered over another link, or has our own ids.
 
-        With ``is_other_peer``, its sender's messages go to another peer of this link (`arrived_on_other_peer`).
+        With ``is_other_peer``, our messages to its sender go to another peer of this link (`arrived_on_other_peer`).
         """
         # PX4 forwards our heartbeats from one of its ports to the others, so they come back over another link.
         if (frame.system_id, frame.component_id) == self._own_source:
@@ -228,7 +228,7 @@ class MultiLinkRoutes:
         link = _link_index(peer)
         if not self._merged.is_duplicate(frame, link, is_other_peer=is_other_peer):
             return False
-        if is_other_peer:  # Our messages over this link go to another peer.
+        if is_other_peer:  # Our messages go to another peer, so the copy is no evidence about this link.
             return True
         # The copy is dropped, but it proves that this link works, and shows to which vehicle the link leads.
         self._probes.record_hardware(frame, link)

@@ -75,7 +75,6 @@ class CameraLink(CameraOrders):
         self._identify_lock = anyio.Lock()
         # Set once `number` is known to be right. Before that, `number` is None, or a guess.
         self._is_found = anyio.Event()
-        # Time of the camera's last HEARTBEAT.
         self._heartbeat_at = -math.inf
         # True if an identified camera was silent and must identify itself again: another camera may now use its id.
         self._must_identify_again = False

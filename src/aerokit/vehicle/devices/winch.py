@@ -113,17 +113,17 @@ class Winch(ReadOnly):
         frame, now = status_before.received_frame, self._context.session.connection.now
         reported_at = now() if frame is None else frame.received_at
         was_turning = abs(status_before.speed) > RATE_TOLERANCE_M_S
-        max_earlier_m: float | None = None
+        max_moved_m: float | None = None
 
         def has_paid_out(status: m.WinchStatus) -> bool:
-            nonlocal max_earlier_m
-            # A turning winch went on turning until it got the command. The first call of this function follows the
-            # acknowledgement, so it limits the length.
-            if max_earlier_m is None:
-                max_earlier_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
-            earlier_m = status.line_length - length_m - status_before.line_length
-            lowest_m, highest_m = sorted((0.0, max_earlier_m))
-            is_near = lowest_m - LENGTH_TOLERANCE_M <= earlier_m <= highest_m + LENGTH_TOLERANCE_M
+            nonlocal max_moved_m
+            # A turning winch has moved its line on between `status_before` and the command. The command was acknowledged
+            # before the first call of this function, so `max_moved_m` is the upper limit.
+            if max_moved_m is None:
+                max_moved_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
+            moved_m = status.line_length - length_m - status_before.line_length
+            lowest_m, highest_m = sorted((0.0, max_moved_m))
+            is_near = lowest_m - LENGTH_TOLERANCE_M <= moved_m <= highest_m + LENGTH_TOLERANCE_M
             return is_near and (not was_turning or abs(status.speed) <= RATE_TOLERANCE_M_S)
 
         return has_paid_out

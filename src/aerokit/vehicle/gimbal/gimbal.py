@@ -48,7 +48,6 @@ class _SystemTracker:
 
     def __init__(self, context: VehicleContext, system_id: int) -> None:
         self._context, self._system_id = context, system_id
-        # The last position, and the time at which it was received.
         self._position: Position | None = None
         self._received_at = 0.0
         self._detach: Detach | None = None

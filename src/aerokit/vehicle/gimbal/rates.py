@@ -100,7 +100,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         orders = self._orders
         self._order = orders.begin_order()
         self._cleanup.enter_context(orders.device.in_use())
-        # Registered before the command, so that the gimbal stops even if the vehicle is closed before the ack.
+        # Registered before the command: the gimbal must also stop if `async with connect(…)` ends before the ack.
         self._cleanup.callback(orders.context.on_finish(self._finish))
         try:
             is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, rates=self._value, flags=self._flags)
