@@ -117,8 +117,8 @@ class Winch(ReadOnly):
 
         def has_paid_out(status: m.WinchStatus) -> bool:
             nonlocal max_moved_m
-            # A turning winch has moved its line on between `status_before` and the command. The command was acknowledged
-            # before the first call of this function, so `max_moved_m` is the upper limit.
+            # A turning winch moved its line on between `status_before` and the command, which was acknowledged before
+            # the first call of this function. `max_moved_m` is therefore the upper limit.
             if max_moved_m is None:
                 max_moved_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
             moved_m = status.line_length - length_m - status_before.line_length

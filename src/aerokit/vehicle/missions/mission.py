@@ -215,7 +215,7 @@ class MissionEndDetector:
         if self._return_began_at is None:
             self._return_began_at = now
         if now - self._return_began_at > RETURN_TIMEOUT_S:
-            return True  # The vehicle may be at a rally point instead, whose position is unknown here.
+            return True  # The vehicle may have returned to a rally point, whose position is unknown here.
         home = session.telemetry.home.latest
         if home is None:
             return False

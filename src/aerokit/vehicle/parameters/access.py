@@ -316,7 +316,7 @@ class ParameterAccess:
             idle_timeout_s=idle_timeout_s,
             on_progress=on_progress,
         )
-        # Many reads need the raised rate.
+        # A higher rate of answers is worth its cost only for many reads.
         raise_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
         try:
             with self._raised_rate(raise_after_s):
