@@ -100,7 +100,8 @@ class LatestMessage(Generic[MessageT]):
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
         self._notified_names: set[str] = set()  # attributes whose listeners the handlers notify
-        self._needs_every_message = False  # True if a handler does more than notify listeners
+        # True if a handler does more than notify listeners, so that no message may be skipped for lack of listeners.
+        self._needs_every_message = False
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
         self._decoded: MessageT | None = None  # cache of the property `message`; may be older than `_latest`

@@ -48,12 +48,15 @@ START_TOLERANCE_S = 0.001
 
 
 class ActionKind(enum.Enum):
-    """Effect of an action on the flight of its members."""
+    """Effect of an action on the flight of its members.
+
+    After a new action of kind ENDS_FLIGHT or MOVES, older actions send nothing more to its members.
+    """
 
     ENDS_FLIGHT = enum.auto()
     """Makes the flight safer (hold, land, return): a member's failure does not stop the others."""
     MOVES = enum.auto()
-    """Overrules older actions, as ENDS_FLIGHT does: they no longer start its members or send them orders."""
+    """Flies the members somewhere, or changes how they fly."""
     ARMS = enum.auto()
     """Only arms. Of the newer actions, only those that end the flight keep its members from starting."""
     ON_GROUND = enum.auto()
@@ -265,7 +268,7 @@ class FleetAction:
             raise OperationRejected(f"{self.name}: {name} is {member.status}")
         # A landing is sent even to a member that was unavailable during the wait.
         if member.absences > absences and not self._ends_flight:
-            raise OperationRejected(f"{self.name}: {name} was unavailable before it started; nothing was sent to it")
+            raise OperationRejected(f"{self.name}: {name} was unavailable meanwhile; no order was sent")
         late_s = connection.now() - began_at - delay_s
         if self._corridors is not None and late_s > self._corridors.slack_s:
             raise OperationRejected(f"{self.name}: {name} would start {late_s:.1f} s late, so it stays where it is")

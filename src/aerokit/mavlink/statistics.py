@@ -54,8 +54,8 @@ class SourceStatistics(SourceFields):
     )
 
     _late_run: int  # length of the current run of repeated frames with consecutive sequence numbers
-    # Two senders with the same ids form two streams: the current one and the other one. These attributes are set when
-    # a second stream begins.
+    # If two senders use the same ids, their sequence numbers form two streams. `expected` belongs to the current one,
+    # these attributes to the other one. They are set when a second stream begins.
     _other_count: int  # number of frames of the other stream
     _other_at: float  # time of its last frame
     _skipped_over: int  # number of frames that count as lost between the two streams
@@ -68,7 +68,7 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # `expected` minus `received`. A frame in sequence does not change it, so only `expected` has to be increased.
+        # The property `received` is `expected` minus this, so that a frame in sequence changes only `expected`.
         self._unreceived = sequence
         # Missing frames: bit 0 is set if the frame before `_missing_base` is missing, bit 1 for the one before that, …
         self._missing = 0

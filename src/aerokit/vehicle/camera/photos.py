@@ -320,8 +320,8 @@ class PhotoInterval:
             first = self._first_after_reset(capture)
             if first is not None:
                 self._continue_after_reset(first)
-            # Without a status, the index of the first capture counts as the start of the series. A later capture with a
-            # much lower index shows that this index was corrupt, and counts as the start instead.
+            # If the camera has not reported its image count, the first capture counts as the start of the series. If a
+            # later capture has a much lower index, the first one was corrupt, and the later one is the start.
             if self._next_index is None or self._contradicts_guess(capture.index):
                 self._guess_start(capture.index)
             if self._is_plausible(capture.index):
