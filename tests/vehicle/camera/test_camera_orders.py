@@ -481,7 +481,28 @@ async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
         assert [order.target_component for order in orders] == [1, 100]
 
 
-@pytest.mark.parametrize("sign", ["report", "status", "order", "number"])
+async def test_late_camera_does_not_disturb_photo_of_guessed_camera() -> None:
+    """The picture that the late camera took earlier must not be returned."""
+    camera = SimulatedCamera()
+    camera.faults.heartbeats_stopped = True
+    camera.faults.lose(m.CameraImageCaptured)
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+        flight.vehicle._session.commands.send_unconfirmed(START, 0, 0, 1, 1, component_id=100)
+        await anyio.sleep(2.0)
+        assert camera.image_count == 1
+        first = flight.vehicle.camera
+        flight.copter.faults.refuse(START, MavResult.ACCEPTED)
+
+        def appear(message: m.CommandLong, *_: object) -> None:
+            camera.faults.heartbeats_stopped = camera.faults.heartbeats_stopped and message.command != START
+
+        flight.copter.observe(m.CommandLong, appear)
+        with pytest.raises(OperationTimeout, match="camera 1 accepted the order, but reported no picture"):
+            await first.take_photo()
+        assert first.number == 1
+
+
+@pytest.mark.parametrize("sign", ["report", "status", "order", "format", "number"])
 async def test_late_camera_does_not_replace_known_autopilot_camera(sign: str) -> None:
     camera = SimulatedCamera()
     camera.faults.heartbeats_stopped = True
@@ -496,6 +517,9 @@ async def test_late_camera_does_not_replace_known_autopilot_camera(sign: str) ->
         elif sign == "order":
             flight.copter.faults.refuse(ZOOM, MavResult.ACCEPTED)
             await first.zoom_to(50)
+        elif sign == "format":
+            flight.copter.faults.refuse(MavCmd.STORAGE_FORMAT, MavResult.ACCEPTED)
+            await first.format_storage()
         else:
             assert flight.vehicle.camera_at(1) is first
         camera.faults.heartbeats_stopped = False

@@ -97,7 +97,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             OperationTimeout: the camera reported no picture, or no camera was found.
         """
         await self._link.require_capability("take_photo", "capture_image")
-        return await self._shutter.take_photo(timeout)
+        with self._link.new_order("photo"):
+            return await self._shutter.take_photo(timeout)
 
     def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.

@@ -369,16 +369,17 @@ class StorageMixin(CameraMixin):
         check_range("number", number, 1, 255)
         await self._link.identify()
         format_medium, reset_image_log = 1, 1  # param2 and param3
-        await self._link.command(
-            MavCmd.STORAGE_FORMAT,
-            number,
-            format_medium,
-            reset_image_log,
-            attempts=1,
-            attempt_timeout=timeout,
-            progress_timeout=timeout,
-            on_progress=on_progress,
-        )
+        with self._link.new_order("storage"):
+            await self._link.command(
+                MavCmd.STORAGE_FORMAT,
+                number,
+                format_medium,
+                reset_image_log,
+                attempts=1,
+                attempt_timeout=timeout,
+                progress_timeout=timeout,
+                on_progress=on_progress,
+            )
         for callback in self._link.on_cleared:  # The captures on the medium are lost.
             callback()
         await self._link.request(m.StorageInformation, 0, timeout=MODE_REQUEST_TIMEOUT_S)

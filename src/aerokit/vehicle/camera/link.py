@@ -73,7 +73,6 @@ class CameraLink(CameraOrders):
         # Called when the camera's log of captures was cleared.
         self.on_cleared: list[Callable[[], None]] = []
         self._identify_lock = anyio.Lock()
-        # Set once `number` is known to be right. Before that, `number` is None, or a guess.
         self._is_found = anyio.Event()
         self._heartbeat_at = -math.inf
         # True if an identified camera was silent and must identify itself again: another camera may now use its id.
@@ -128,7 +127,7 @@ class CameraLink(CameraOrders):
         return f"camera {self.number}{f' ({model})' if model else ''}"
 
     def bind(self, number: int, *, is_guess: bool = False) -> None:
-        """Address this camera from now on. Later calls do nothing, unless this number is a guess that got no order."""
+        """Address this camera from now on. Later calls do nothing, unless this number is a guess without a valid order."""
         has_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
         if self._is_found.is_set() or has_orders:
             return

@@ -72,6 +72,8 @@ class CameraOrders:
 
     # Topics of the orders given by this object.
     _ordered_topics: set[Topic]
+    # Set once `number` is known to be right. Before that, `number` is None, or a guess.
+    _is_found: anyio.Event
 
     @property
     def is_autopilot_attached(self) -> bool:
@@ -117,7 +119,10 @@ class CameraOrders:
 
     @contextmanager
     def new_order(self, subject: str) -> Iterator[Order]:
-        """Begin an order. If the block raises, the order is withdrawn."""
+        """Begin an order. If the block raises, the order is withdrawn.
+
+        During the block, no camera that is found late takes the place of a guess.
+        """
         order = self.begin_order(subject)
         try:
             yield order
@@ -162,6 +167,7 @@ class CameraOrders:
                     attempts=attempts,
                     **options,
                 )
+                self._is_found.set()  # A camera that accepts orders is there, so no other camera takes its place.
             except CommandRejected as error:
                 # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
