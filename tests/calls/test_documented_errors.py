@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -22,10 +23,14 @@ from provoked_flight import FLIGHT
 from provoked_gimbals import GIMBALS
 from provoked_settings import SETTINGS
 from provoked_transfers import TRANSFERS
+from public_surface import CLASSES
 from rtk_calls import RTK
 from stream_calls import stream_provocations
 
 from aerokit import errors
+from aerokit.connection.bus import Subscription
+from aerokit.connection.cells import StateCell
+from aerokit.connection.connection import Connection
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 
@@ -50,6 +55,14 @@ BY_DEFAULT = ("Vehicle", "Guided", "Parameters", "MissionControl", "Files", "Gim
 def test_each_documented_error_is_provoked() -> None:
     missing = sorted(PROMISED - PROVOCATIONS.keys())
     assert not missing, f"add provocations to one of the tables in PROVOCATIONS, or remove the promises: {missing}"
+
+
+@pytest.mark.parametrize("cls", [cls for cls in CLASSES if cls not in (Connection, StateCell, Subscription)])
+def test_public_methods_check_their_arguments(cls: type) -> None:
+    """The three classes left out check single methods, because the library itself calls the others often."""
+    methods = {name: value for name, value in vars(cls).items() if name[0] != "_" and inspect.isfunction(value)}
+    with_arguments = {name: method for name, method in methods.items() if len(inspect.signature(method).parameters) > 1}
+    assert not [name for name, method in with_arguments.items() if not hasattr(method, "__wrapped__")]
 
 
 def groups() -> Iterator[tuple[str, list[tuple[str, str]]]]:

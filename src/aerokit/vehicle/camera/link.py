@@ -127,7 +127,7 @@ class CameraLink(CameraOrders):
         return f"camera {self.number}{f' ({model})' if model else ''}"
 
     def bind(self, number: int, *, is_guess: bool = False) -> None:
-        """Address this camera from now on. Later calls do nothing, unless this number is a guess without a valid order."""
+        """Address this camera from now on. Later calls do nothing, unless this number is a guess without orders."""
         has_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
         if self._is_found.is_set() or has_orders:
             return

@@ -69,12 +69,12 @@ class TimesyncAnswers:
                 connection.send(answer, to=self._session.system_id)
 
 
-@checks_arguments
 class _EncodedMeasurement(NamedTuple):
     messages: tuple[Message, ...]
     measured_at: float
 
 
+@checks_arguments
 class MeasurementStream(Generic[MeasurementT]):
     """Sends the measurements passed to ``send``: each at most once, and at most ``rate_hz`` measurements a second.
 
