@@ -188,6 +188,28 @@ async def test_late_denial_ends_only_the_newest_wait_of_a_manager() -> None:
         assert ends == {2: CommandRejected, 1: OperationTimeout}
 
 
+async def test_late_denial_and_newer_order_leave_older_wait_of_a_manager() -> None:
+    """The newer order claims control and forgets the denial; the answer to it takes longer than a check."""
+    async with mounted() as flight:
+        flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
+        first, second = flight.vehicle.gimbals[1], flight.vehicle.gimbals[2]
+        async with anyio.create_task_group() as tasks:
+
+            async def point_first() -> None:
+                with pytest.raises(OperationTimeout):
+                    await first.point(-30.0, 0.0, timeout=6.0)
+
+            tasks.start_soon(point_first)
+            await anyio.sleep(1.0)
+            denial = m.CommandAck(PITCHYAW, MavResult.DENIED, 0, 0, *own_ids(flight))
+            asyncio.get_running_loop().call_later(3.0, flight.copter.send, denial)
+            with pytest.raises(CommandRejected):
+                await second.point(-30.0, 0.0, timeout=6.0)
+            flight.copter.faults.commands[PITCHYAW] = CommandFault(refuse_with=MavResult.ACCEPTED, delay_s=0.7)
+            with pytest.raises(OperationTimeout):
+                await second.point(-40.0, 0.0, timeout=3.0)
+
+
 async def test_second_copy_of_denial_does_not_end_wait() -> None:
     """The first copy made aerokit claim control and send the order again."""
     gimbal = SimulatedGimbal(slew_deg_s=30.0)

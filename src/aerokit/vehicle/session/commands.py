@@ -44,6 +44,12 @@ class _Options(NamedTuple):
     was_just_sent: bool = False
 
 
+class _LateRefusal(NamedTuple):
+    accepted_at: float  # time of the last ACCEPTED before the refusal
+    received_at: float
+    result: int
+
+
 class CommandSender:
     """Runs the command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
@@ -81,8 +87,8 @@ class CommandSender:
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
         self._refused_at: dict[_Key, float] = {}
-        # Time and MAV_RESULT of the last refusal of each command that arrived when no ack was expected.
-        self._late_refusals: dict[_Key, tuple[float, int]] = {}
+        # The last refusal of each command that arrived when no ack was expected.
+        self._late_refusals: dict[_Key, _LateRefusal] = {}
         self._is_closed = False
         self._detach_callbacks = (
             connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
@@ -201,13 +207,12 @@ class CommandSender:
         """Return the MAV_RESULT of a refusal that arrived after ``since``, when no ack was expected; None if none did.
 
         Such a refusal shows that the last call took a late or repeated ack of an earlier call for its own. If an
-        ACCEPTED arrived after ``since``, the refusal belongs to that newer call, and the result is None.
+        ACCEPTED arrived between ``since`` and the refusal, that call is a newer one, and the result is None.
         """
-        key = (component_id, command)
-        if self._accepted_at.get(key, -math.inf) > since:
+        refusal = self._late_refusals.get((component_id, command))
+        if refusal is None or not refusal.accepted_at <= since <= refusal.received_at:
             return None
-        received_at, result = self._late_refusals.get(key, (-math.inf, None))
-        return result if received_at >= since else None
+        return refusal.result
 
     def forget_result(self, command: int, component_id: int | None = None) -> None:
         key = (self._component_id if component_id is None else component_id, command)
@@ -334,4 +339,5 @@ class CommandSender:
             # Soon after another refusal, this ack may be a copy of it.
             if now - self._refused_at.get(key, -math.inf) > PENDING_ACK_TIMEOUT_S:
                 self._results[key] = ack.result
-                self._late_refusals[key] = now, ack.result
+                accepted_at = self._accepted_at.get(key, -math.inf)
+                self._late_refusals[key] = _LateRefusal(accepted_at, now, ack.result)
