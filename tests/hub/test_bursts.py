@@ -240,6 +240,27 @@ async def test_port_that_closes_in_mid_burst_gets_nothing() -> None:
 
 
 @virtual
+async def test_port_that_closes_while_its_frames_are_checked() -> None:
+    """A program that hears of a second sender with the same ids closes the endpoint."""
+    kinds: list[str] = []
+    vehicles = BurstLink()
+    async with Hub([Endpoint(vehicles, name="a"), Endpoint(SlowLink(), name="b")]) as hub:
+        vehicle, twin = FrameEncoder(1, 1), FrameEncoder(1, 1)
+        vehicles.read(vehicle.encode(COPTER))
+
+        def close(event: HubEvent) -> None:
+            kinds.append(event.kind)
+            if event.kind == "duplicate_sender":
+                hub._attachments["a"]._on_down()
+
+        hub.on_event(close)
+        while "duplicate_sender" not in kinds:
+            vehicles.read(vehicle.encode(COPTER))
+            vehicles.read_from([(OTHER_PEER, twin.encode(COPTER))])
+        assert kinds == ["duplicate_sender"]
+
+
+@virtual
 async def test_frames_before_the_loss_of_a_link_are_forwarded() -> None:
     async with known_vehicle() as (hub, vehicles, station, vehicle):
         frames = encoded(vehicle, *telemetry(2))

@@ -113,7 +113,8 @@ class Switch:
 
         ``data`` has the received bytes; None if they are not exactly the bytes of these frames.
         """
-        if port.ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
+        ingress = port.ingress  # A listener may remove the port during the checks below.
+        if ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
             if port.guard is not None:
                 for frame in frames:
                     port.guard.admits(frame, framer, port.peer)  # called because the guard records the ids of each peer
@@ -128,7 +129,7 @@ class Switch:
         if now - arrived_at > ORDER_MAX_AGE_S:
             frames = self._without_commands(port, frames, arrived_at)
             data = None
-        plans = self.router.route_all(port.ingress, frames, arrived_at, out_of_order)
+        plans = self.router.route_all(ingress, frames, arrived_at, out_of_order)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
