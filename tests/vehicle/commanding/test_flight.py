@@ -920,6 +920,24 @@ async def test_set_home_replaced_by_newer_one_is_rejected(flying: Flight) -> Non
         await first
 
 
+async def test_set_home_is_not_replaced_by_refused_one(flying: Flight) -> None:
+    copter, home = flying.copter, flying.vehicle.home.value
+    place = home.position.replace(altitude_amsl_m=home.altitude_amsl_m)
+    old_home = copter.build(m.HomePosition.ID)
+    assert old_home is not None
+    copter.faults.refuse(MavCmd.REQUEST_MESSAGE)
+    copter.faults.lose(m.HomePosition)
+    first = asyncio.ensure_future(flying.vehicle.set_home(place.offset(north_m=30.0)))
+    await anyio.sleep(0.5)
+    copter.faults.refuse(MavCmd.DO_SET_HOME)
+    with pytest.raises(CommandRejected):
+        await flying.vehicle.set_home(place.offset(north_m=60.0))
+    copter.send(old_home)
+    await anyio.sleep(0.5)
+    copter.send_built(m.HomePosition.ID)
+    await first
+
+
 async def test_look_at_refused(flying: Flight) -> None:
     flying.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, MavResult.DENIED, "No mount")
     with pytest.raises(CommandRejected, match="No mount"):

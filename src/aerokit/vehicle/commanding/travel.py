@@ -370,17 +370,13 @@ class TravelActions(VehicleBase):
             raise InvalidArgument(
                 "place.altitude_amsl_m = None is not allowed: home needs an altitude above mean sea level"
             )
-        home, home_order = self.telemetry.home, self._arbiter.device_order(HOME)
-        with self._arbiter.auxiliary_order(home_order) as order:
-            if place is None:
-                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1 means the present position.
-            else:
-                # The command takes altitudes above mean sea level only.
-                amsl_place = position_with_altitude(place).replace(altitude_relative_m=None)
-                latitude, longitude, altitude, _ = self._position.global_target(amsl_place)
-                position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
-                send = self._session.commands.send_place
-                await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
+        home, home_order = self.telemetry.home, self._arbiter.device_order(HOME, may_be_withdrawn=True)
+        try:
+            await self._send_home(home_order, place)
+        except BaseException:
+            home_order.withdraw()  # A call that was refused or not answered does not replace an earlier one.
+            raise
+        home_order.commit()
         acknowledged_at = self.connection.now()
 
         def is_set(reported: Home) -> bool:
@@ -399,6 +395,18 @@ class TravelActions(VehicleBase):
                 task.cancel()
         if not is_set(reported):
             raise OperationRejected(f"set_home: {SUPERSEDED}")
+
+    async def _send_home(self, home_order: Order, place: Position | Home | None) -> None:
+        with self._arbiter.auxiliary_order(home_order) as order:
+            if place is None:
+                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1 means the present position.
+                return
+            # The command takes altitudes above mean sea level only.
+            amsl_place = position_with_altitude(place).replace(altitude_relative_m=None)
+            latitude, longitude, altitude, _ = self._position.global_target(amsl_place)
+            position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
+            send = self._session.commands.send_place
+            await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
 
     async def _request_home(self) -> None:
         with suppress(AerokitError):
