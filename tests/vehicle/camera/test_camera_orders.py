@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -462,13 +463,20 @@ async def test_order_is_not_resent_to_silent_camera() -> None:
 # ------------------------------------------------------------------------------ a camera that is found late
 
 
-async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
+@asynccontextmanager
+async def guessed_camera() -> AsyncIterator[tuple[Any, SimulatedCamera]]:
+    """A copter, and a camera that is not found: ``vehicle.camera`` stands for a camera of the autopilot."""
     camera = SimulatedCamera()
     camera.faults.heartbeats_stopped = True
     async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
-        first = flight.vehicle.camera
         with pytest.raises(OperationTimeout, match="did not identify itself"):
-            await first.wait_found()
+            await flight.vehicle.camera.wait_found()
+        yield flight, camera
+
+
+async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
+    async with guessed_camera() as (flight, camera):
+        first = flight.vehicle.camera
         with pytest.raises(CommandRejected):  # The autopilot has no camera.
             await first.zoom_to(50)
         assert first.number == 1
@@ -483,10 +491,8 @@ async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
 
 async def test_late_camera_does_not_disturb_photo_of_guessed_camera() -> None:
     """The picture that the late camera took earlier must not be returned."""
-    camera = SimulatedCamera()
-    camera.faults.heartbeats_stopped = True
-    camera.faults.lose(m.CameraImageCaptured)
-    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+    async with guessed_camera() as (flight, camera):
+        camera.faults.lose(m.CameraImageCaptured)
         flight.vehicle._session.commands.send_unconfirmed(START, 0, 0, 1, 1, component_id=100)
         await anyio.sleep(2.0)
         assert camera.image_count == 1
@@ -494,7 +500,8 @@ async def test_late_camera_does_not_disturb_photo_of_guessed_camera() -> None:
         flight.copter.faults.refuse(START, MavResult.ACCEPTED)
 
         def appear(message: m.CommandLong, *_: object) -> None:
-            camera.faults.heartbeats_stopped = camera.faults.heartbeats_stopped and message.command != START
+            if message.command == START:
+                camera.faults.heartbeats_stopped = False
 
         flight.copter.observe(m.CommandLong, appear)
         with pytest.raises(OperationTimeout, match="camera 1 accepted the order, but reported no picture"):
@@ -504,12 +511,8 @@ async def test_late_camera_does_not_disturb_photo_of_guessed_camera() -> None:
 
 @pytest.mark.parametrize("sign", ["report", "status", "order", "format", "number"])
 async def test_late_camera_does_not_replace_known_autopilot_camera(sign: str) -> None:
-    camera = SimulatedCamera()
-    camera.faults.heartbeats_stopped = True
-    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+    async with guessed_camera() as (flight, camera):
         first = flight.vehicle.camera
-        with pytest.raises(OperationTimeout, match="did not identify itself"):
-            await first.wait_found()
         if sign == "report":
             flight.copter.send(m.CameraFeedback(0, 1, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0))
         elif sign == "status":
