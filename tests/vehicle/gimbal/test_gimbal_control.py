@@ -11,7 +11,7 @@ from typing import Any
 import anyio
 import anyio.lowlevel
 import pytest
-from flight_harness import Px4Flight, block_loop, now, open_flight, open_px4
+from flight_harness import Px4Flight, block_loop, now, open_flight, open_px4, suspend_computer
 from gimbal_stage import (
     CONFIGURE,
     MOUNT,
@@ -427,6 +427,31 @@ async def test_zero_rate_that_overtakes_rates_is_sent_again(how: str) -> None:
         last = [message for _, message in flight.wire.sent if isinstance(message, kinds)][-1]
         assert isinstance(last, m.GimbalManagerSetPitchyaw), "it has no acknowledgement, which could be mistaken"
         assert (last.pitch_rate, last.yaw_rate) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("pause", ["sleep", "block"])
+async def test_zero_rates_end_after_pause_of_program(pause: str) -> None:
+    """Another station may have begun to turn the gimbal meanwhile."""
+    zero_rate = anyio.Event()
+
+    def on_message(message: m.GimbalManagerSetPitchyaw, *_: object) -> None:
+        if message.pitch_rate == 0.0:
+            zero_rate.set()
+
+    async with with_gimbals(SimulatedGimbal()) as flight:
+        with suppress(Boom):
+            async with flight.vehicle.gimbal.rates(-5.0, 10.0):
+                await anyio.sleep(0.5)
+                flight.copter.observe(m.GimbalManagerSetPitchyaw, on_message)
+                raise Boom
+        await zero_rate.wait()
+        if pause == "sleep":
+            suspend_computer(flight.vehicle, 3600.0)
+        else:
+            block_loop(20.0)
+        sent = pitchyaws(flight).count((0.0, 0.0))
+        await anyio.sleep(1.0)
+        assert pitchyaws(flight).count((0.0, 0.0)) == sent
 
 
 async def test_rates_after_zero_rate_end_despite_lost_message() -> None:

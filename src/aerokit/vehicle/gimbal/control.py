@@ -121,6 +121,7 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
+        began_at = self._session.connection.now()
         with self._orders.context.arbiter.auxiliary_order(ends_with_actions=False) as order:
             await self._orders.context.sender.send_long(
                 order,
@@ -133,11 +134,17 @@ class ReleaseCommand:
                 was_just_sent=True,
             )
         if self._final_message is not None:
-            for _ in range(FINAL_MESSAGE_COUNT):
-                if not self._session.is_open or not self._is_still_due():
-                    break
-                self._session.connection.send(self._final_message)
-                await asyncio.sleep(FINAL_MESSAGE_INTERVAL_S)
+            await self._send_repeatedly(self._final_message, began_at)
+
+    async def _send_repeatedly(self, message: Message, began_at: float) -> None:
+        arbiter = self._orders.context.arbiter
+        for _ in range(FINAL_MESSAGE_COUNT):
+            # After a pause of this program, another station may use the gimbal.
+            was_paused = arbiter.slept_since(began_at) > 0 or not arbiter.is_state_recent
+            if was_paused or not self._session.is_open or not self._is_still_due():
+                return
+            self._session.connection.send(message)
+            await asyncio.sleep(FINAL_MESSAGE_INTERVAL_S)
 
     def _is_target_silent(self) -> bool:
         is_autopilot = self._target == self._session.component_id
