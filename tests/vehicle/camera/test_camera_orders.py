@@ -489,6 +489,16 @@ async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
         assert [order.target_component for order in orders] == [1, 100]
 
 
+async def test_late_camera_is_found_while_guessed_camera_is_asked() -> None:
+    camera = SimulatedCamera()
+    camera.faults.heartbeats_stopped = True
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+        flight.copter.faults.ignore(MavCmd.REQUEST_MESSAGE)
+        asyncio.get_running_loop().call_later(3.5, setattr, camera.faults, "heartbeats_stopped", False)
+        information = await flight.vehicle.camera.wait_found()
+        assert (information.model, flight.vehicle.camera.number) == ("Simulated camera", 100)
+
+
 async def test_late_camera_does_not_disturb_photo_of_guessed_camera() -> None:
     """The picture that the late camera took earlier must not be returned."""
     async with guessed_camera() as (flight, camera):

@@ -162,7 +162,9 @@ class CameraLink(CameraOrders):
                 if self.number is None:
                     await self._find_first_camera()
                 # Another call may have received the information while this call waited for the lock.
-                if self._needs_information() and not self.is_trigger:
+                asked: int | None = None
+                while self._needs_information() and not self.is_trigger and self.number != asked:
+                    asked = self.number  # During the request, another camera may take the place of a guess.
                     await self._request_information()
         return self.information.latest
 
