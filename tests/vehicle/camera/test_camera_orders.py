@@ -464,11 +464,12 @@ async def test_order_is_not_resent_to_silent_camera() -> None:
 
 
 @asynccontextmanager
-async def guessed_camera() -> AsyncIterator[tuple[Any, SimulatedCamera]]:
-    """A copter, and a camera that is not found: ``vehicle.camera`` stands for a camera of the autopilot."""
+async def guessed_camera(kind: Any = SimulatedCopter) -> AsyncIterator[tuple[Any, SimulatedCamera]]:
+    """A vehicle, and a camera that is not found: ``vehicle.camera`` stands for a camera of the autopilot."""
     camera = SimulatedCamera()
     camera.faults.heartbeats_stopped = True
-    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+    open_any = open_px4 if kind is SimulatedPx4 else open_flight
+    async with open_any(kind(boot_time_s=0.0, components=[camera])) as flight:
         with pytest.raises(OperationTimeout, match="did not identify itself"):
             await flight.vehicle.camera.wait_found()
         yield flight, camera
@@ -487,6 +488,17 @@ async def test_late_camera_replaces_guessed_autopilot_camera() -> None:
         await first.zoom_to(50)
         orders = [message for message in flight.wire.commands(ZOOM) if isinstance(message, m.CommandLong)]
         assert [order.target_component for order in orders] == [1, 100]
+
+
+async def test_late_camera_does_not_have_storage_of_autopilot() -> None:
+    """PX4 reports its own memory card."""
+    async with guessed_camera(SimulatedPx4) as (flight, camera):
+        storage = flight.vehicle.camera.storage
+        autopilots = await storage.wait_until(lambda _: True)
+        camera.faults.heartbeats_stopped = False
+        await anyio.sleep(1.5)
+        assert flight.vehicle.camera.number == 100
+        assert storage.latest != autopilots
 
 
 async def test_late_camera_is_found_while_guessed_camera_is_asked() -> None:

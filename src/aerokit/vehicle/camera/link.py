@@ -66,6 +66,7 @@ class CameraLink(CameraOrders):
         self._ordered_topics = set()
         self._listeners: list[tuple[type[Message], Callable[[Any], object]]] = []
         self._detach_listeners: list[Detach] = []
+        self._cells: list[StateCell[Any]] = []
         self.requests: MessageRequests = MessageRequests(self)
         self._is_polling = False
         # Messages that the camera refused to send.
@@ -141,6 +142,8 @@ class CameraLink(CameraOrders):
         self._component = self._component_of(component_id)
         self._heartbeat_at = self._session.connection.last_heartbeat_at(self._session.system_id, component_id)
         self._forget_refusals()
+        for cell in self._cells:  # A value may be from the autopilot, such as PX4's own storage.
+            cell.forget()
         for detach in self._detach_listeners:
             detach()
         for message_type, callback in self._listeners:
@@ -234,6 +237,7 @@ class CameraLink(CameraOrders):
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
         cell: StateCell[Any] = self._session.connection.new_cell(name, waits_for)
         self._session.register_cell(cell)
+        self._cells.append(cell)
         return cell
 
     def polled_cell(self, name: str, message_type: type[Message], period_s: float) -> StateCell[Any]:
