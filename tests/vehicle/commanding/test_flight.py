@@ -890,6 +890,19 @@ async def test_take_off_reaches_its_altitude_when_home_is_moved(grounded: Flight
     assert (vehicle.position.value.altitude_relative_m or 0.0) < 6.0
 
 
+@pytest.mark.parametrize("name", ["go_to", "loiter"])
+async def test_flight_to_place_keeps_altitude_when_home_is_moved(flying: Flight, name: str) -> None:
+    """ArduPilot converts the altitude above home when it gets the order."""
+    vehicle, home, target = flying.vehicle, flying.vehicle.home.value, north_of_home(flying, 60.0, 30.0)
+    place = home.position.replace(altitude_amsl_m=home.altitude_amsl_m + 20.0)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(partial(getattr(vehicle, name), target, timeout=60.0))
+        await anyio.sleep(2.0)
+        await vehicle.set_home(place)
+    assert flying.copter.motion.north == pytest.approx(60.0, abs=2.5)
+    assert -flying.copter.motion.down == pytest.approx(30.0, abs=2.5)
+
+
 async def test_set_home_requests_lost_report_again(flying: Flight) -> None:
     flying.copter.faults.lose(m.HomePosition, times=3)
     await flying.vehicle.set_home()

@@ -354,6 +354,21 @@ class VehiclePosition:
         altitude_m = self.home_altitude() + target.altitude_relative_m
         return target.replace(altitude_relative_m=None, altitude_amsl_m=altitude_m)
 
+    def as_accepted(self, target: Position) -> Position:
+        """Return a target that the vehicle has just accepted, with its altitude above mean sea level if home is known.
+
+        ArduPilot also converts the altitude at this time, and keeps it when home moves later (ArduCopter/
+        mode_guided.cpp, set_destination; GCS_MAVLink_Plane.cpp, handle_command_int_do_reposition).
+        """
+        position, home = self._telemetry.position, self._telemetry.home
+        home_m = None if home.latest is None else home.latest.altitude_amsl_m
+        if position.latest is not None and position.updated_at > home.updated_at:  # A HOME_POSITION may have been lost.
+            amsl_m, relative_m = position.latest.altitude_amsl_m, position.latest.altitude_relative_m
+            home_m = home_m if amsl_m is None or relative_m is None else amsl_m - relative_m
+        if target.altitude_relative_m is None or home_m is None:
+            return target
+        return target.replace(altitude_relative_m=None, altitude_amsl_m=home_m + target.altitude_relative_m)
+
     def command_place(self, target: Position, name: str = "target") -> dict[str, Any]:
         """Return the target as arguments of a COMMAND_INT; see :meth:`global_target`."""
         latitude, longitude, altitude, frame = self.global_target(target, name)

@@ -112,6 +112,7 @@ class RoundFlight:
                 with context.arbiter.changing_mode():
                     send = self._session.commands.send_int
                     await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
+                self._center = context.vehicle_position.as_accepted(self._center)
                 with self._session.streaming("position"):
                     await self._await_rounds(order, mode, stay_s, radius_m)
                 if holds_at_end:

@@ -130,6 +130,8 @@ class TravelActions(VehicleBase):
         try:
             with self._flight_cleanup.flying(order):
                 unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
+                if unacknowledged_target is None:  # Otherwise the vehicle converts the altitude at each repetition.
+                    target = self._position.as_accepted(target)
                 is_incomplete = True
                 if speed_m_s is not None and not self._speeds_by_reposition:
                     # ArduPilot applies the speed only once the vehicle is on its way.
