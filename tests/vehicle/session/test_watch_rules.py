@@ -198,6 +198,15 @@ def test_ordered_reboot_is_detected_immediately() -> None:
     assert stage.clock(7200, after=10.0) == 1
 
 
+def test_late_message_after_order_to_reboot_is_no_reboot() -> None:
+    stage = Watched()
+    stage.clock(60_000)
+    with stage.watch.expecting_reboot():
+        stage.clock(61_000, after=1.0)
+        assert stage.clock(61_100, after=4.1) == 0  # the link holds all messages back for four seconds
+        assert stage.clock(70_000, after=5.0) == 0
+
+
 def test_timesync_request_of_vehicle_is_ignored() -> None:
     stage = Watched()
     stage.receive(Timesync(100_000_000_000, 5))

@@ -38,7 +38,8 @@ REBOOT_MIN_DECREASE_MS = 3000
 # message may be late.
 REBOOT_CONFIRM_S = 0.2
 # After a reboot was ordered, the vehicle counts as rebooted when its time since boot is more than this behind the
-# expected time. A boot takes longer than this, and messages are delayed by less.
+# expected time. A boot takes longer than this. Late messages are behind, too, so the time since boot must also be less
+# than the time since the order.
 EXPECTED_REBOOT_MIN_LAG_MS = 2000
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
 # many seconds apart.
@@ -99,7 +100,8 @@ class VehicleWatch:
         # The lowest reading of each clock whose time has decreased, until `_is_decrease_confirmed` has decided whether
         # the decrease shows a reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
-        self._expects_reboot = False
+        # Time of an order to reboot that is in progress; None if there is none.
+        self._reboot_ordered_at: float | None = None
         # The vehicle's time in the last answer to a TIMESYNC request.
         self._last_answer = _ClockReading(0, read_at=-math.inf)
         attach = connection.bus.attach
@@ -141,19 +143,25 @@ class VehicleWatch:
         first, last = self._first_reading, self._last_readings.get("time_boot_ms")
         if first is None or last is None:
             return None
-        span_s = last.read_at - first.read_at
+        return last.milliseconds + self._clock_speed() * (now - last.read_at)
+
+    def _clock_speed(self) -> float:
+        """Return how many milliseconds the vehicle's clock advances in a second."""
+        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
+        span_s = 0.0 if first is None or last is None else last.read_at - first.read_at
         # The clock of a simulation may be faster than real time.
-        ms_per_second = (last.milliseconds - first.milliseconds) / span_s if span_s > CLOCK_SPAN_S else 1000.0
-        return last.milliseconds + ms_per_second * (now - last.read_at)
+        if first is None or last is None or span_s <= CLOCK_SPAN_S:
+            return 1000.0
+        return (last.milliseconds - first.milliseconds) / span_s
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
         """Detect a reboot during a `with` block even if the previous boot was very recent."""
-        self._expects_reboot = True
+        self._reboot_ordered_at = self._connection.now()
         try:
             yield
         finally:
-            self._expects_reboot = False
+            self._reboot_ordered_at = None
 
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Detect a reboot by the time since boot in an answer to our TIMESYNC request."""
@@ -213,10 +221,7 @@ class VehicleWatch:
         """
         reading = _ClockReading(milliseconds, self._now())
         previous = self._last_readings.get(clock, reading)
-        # How far the vehicle's clock is behind its expected time. If this or the previous message was late, the result
-        # is wrong by the delay; `EXPECTED_REBOOT_MIN_LAG_MS` allows for that.
-        behind_ms = 1000 * (frame.received_at - previous.read_at) - (milliseconds - previous.milliseconds)
-        if self._expects_reboot and behind_ms > EXPECTED_REBOOT_MIN_LAG_MS:
+        if self._is_expected_reboot(frame, previous, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
         elif previous.milliseconds - milliseconds <= REBOOT_MIN_DECREASE_MS:  # The decrease is too small for a reboot.
             self._last_readings[clock] = reading
@@ -226,6 +231,16 @@ class VehicleWatch:
             self._decreased_readings.pop(clock, None)
         elif self._is_decrease_confirmed(clock, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
+
+    def _is_expected_reboot(self, frame: Frame, previous: _ClockReading, milliseconds: int) -> bool:
+        """Return True if this time since boot shows that an order to reboot was executed."""
+        if self._reboot_ordered_at is None:
+            return False
+        # How far the vehicle's clock is behind its expected time. If this or the previous message was late, the result
+        # is wrong by the delay.
+        behind_ms = 1000 * (frame.received_at - previous.read_at) - (milliseconds - previous.milliseconds)
+        since_order_ms = self._clock_speed() * (self._now() - self._reboot_ordered_at)
+        return behind_ms > EXPECTED_REBOOT_MIN_LAG_MS and milliseconds < since_order_ms
 
     def _is_decrease_confirmed(self, clock: str, milliseconds: int) -> bool:
         """Return True if the time decreased at least ``REBOOT_CONFIRM_S`` ago and has advanced since."""
@@ -243,7 +258,7 @@ class VehicleWatch:
         self._decreased_readings = {}
         self._first_reading = None
         self._last_answer = _ClockReading(0, now)
-        self._expects_reboot = False
+        self._reboot_ordered_at = None
         self.reboots += 1
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
