@@ -653,6 +653,34 @@ async def test_wait_finished_without_start_is_rejected() -> None:
             await flight.vehicle.mission.pause()
 
 
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_completion_of_replaced_mission_does_not_finish_next_one(opened: Any) -> None:
+    async with armed(opened) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        await mission.upload(short_mission(flight, waypoint(*near_home(24), altitude_relative_m=4)))
+        with pytest.raises(OperationRejected if opened is open_px4 else OperationTimeout):
+            await mission.wait_finished(timeout=20)
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        assert mission.reached == 3
+
+
+async def test_mission_that_pilot_starts_again_is_waited_for() -> None:
+    """ArduCopter flies a complete mission again when the pilot selects AUTO (AP_Mission.cpp, resume)."""
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        vehicle = flight.vehicle
+        await vehicle.mission.start()
+        await vehicle.mission.wait_finished(timeout=60)
+        await vehicle.go_to(vehicle.home.value.position)
+        flight.pilot_takes_over(CopterMode.AUTO)
+        await vehicle.mode.wait_until(lambda mode: mode.name == "AUTO")
+        await vehicle.mission.wait_finished(timeout=60)
+        assert flight.copter.motion.north == pytest.approx(12.0, abs=2.5)
+
+
 async def test_disarming_ends_wait_finished() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.start()

@@ -67,14 +67,17 @@ class PlanCache:
         self.changes: int = 0  # number of calls of `set` and `forget`
         # True if the vehicle offers the plan as a file; None until tried.
         self.has_file: bool | None = None
+        self.on_forget: Callable[[], None] = lambda: None
 
     def set(self, items: Sequence[MissionItem], now: float, plan_id: int = 0) -> None:
         self.items, self.updated_at, self.plan_id = tuple(items), now, plan_id
         self.changes += 1
 
     def forget(self, now: float) -> None:
+        """Record that the plan was, or may have been, replaced."""
         self.items, self.updated_at, self.plan_id = None, now, 0
         self.changes += 1
+        self.on_forget()
 
 
 class PlanVersion(NamedTuple):
@@ -108,6 +111,7 @@ class PlanContext:
             session.connection.bus.attach_event(MissionFinished, self._on_finished),
         )
         self.tracker: MissionTracker = MissionTracker(session, self._may_end_by_landing)
+        self.caches[MavMissionType.MISSION].on_forget = self.tracker.on_plan_replaced
 
     def _may_end_by_landing(self) -> bool:
         """Return True if the last item of the mission is a landing or a return, or is unknown."""
@@ -212,6 +216,9 @@ class MissionTracker:
         self._reached_since_start: int | None = None
         # True if the last mission was flown to its end.
         self.is_complete: bool = False
+        # True if another mission has replaced that mission, and was not flown yet.
+        self._was_replaced = False
+        self._mode_changed_at = -math.inf
         # Time of the report that changed `reached`.
         self._reached_at = -math.inf
         # Time of the last report that the last item is the current one.
@@ -227,6 +234,7 @@ class MissionTracker:
             telemetry.mission_current.observe(self._on_current, every_arrival=True),
             telemetry.mission_reached.observe(self._on_reached, every_arrival=True),
             telemetry.armed.observe(self._on_armed),
+            telemetry.mode.observe(self._on_mode),
             session.connection.on_end(self.close),
             lambda: self.close(ConnectionClosed("the async with block of this vehicle was left")),
         )
@@ -237,6 +245,13 @@ class MissionTracker:
         """Index of the last item. None if the mission is empty or its length unknown."""
         count = self.count.latest
         return count - 1 if count else None
+
+    @property
+    def is_present_plan_complete(self) -> bool:
+        """True if the mission that is on the vehicle now was flown to its end."""
+        # After a change to the mission mode, the vehicle may fly the mission again, as the next MISSION_CURRENT shows.
+        is_outdated = self.is_in_mission_mode and self.progress.updated_at <= self._mode_changed_at
+        return self.is_complete and not self._was_replaced and not is_outdated
 
     @property
     def is_last_item_reached(self) -> bool:
@@ -250,6 +265,10 @@ class MissionTracker:
     def on_transfer_count(self, count: int) -> None:
         self.count.set(count, Source(self._session.system_id, self._session.component_id, "MISSION_COUNT"))
 
+    def on_plan_replaced(self) -> None:
+        self._was_replaced = self.is_complete
+        self._reached_since_start = None
+
     def start(self) -> None:
         """Begin to track a new flight of the mission."""
         self._has_begun = False
@@ -258,7 +277,7 @@ class MissionTracker:
 
     def discard_completion(self) -> None:
         if not self._has_begun:
-            self.is_complete = False
+            self.is_complete = self._was_replaced = False
             # Reports of completion before this time are about the previous flight.
             self.stale_until = self._session.connection.now() + STALE_STATE_S
 
@@ -266,7 +285,7 @@ class MissionTracker:
         for cell in (self.current, self.count, self.progress):
             cell.forget()
         self.reached = self._reached_since_start = None
-        self.is_complete = False
+        self.is_complete = self._was_replaced = False
         self._has_begun = False
 
     def close(self, error: Exception) -> None:
@@ -309,9 +328,12 @@ class MissionTracker:
             must_start = state == _ACTIVE and (self.is_complete or not self._has_begun)
             if must_start and self.is_in_mission_mode and self._session.telemetry.is_armed:
                 self._has_begun = True
-                self.is_complete = False
+                self.is_complete = self._was_replaced = False
         elif self._session.connection.now() >= self.stale_until:
             self._complete()
+
+    def _on_mode(self, *_: object) -> None:
+        self._mode_changed_at = self._session.connection.now()
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
         # A vehicle that disarms on its way to a last waypoint has not flown the mission: it may have hit a slope.

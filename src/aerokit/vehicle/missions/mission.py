@@ -108,7 +108,7 @@ class MissionEndDetector:
 
     def _is_end_reported(self) -> bool:
         """Return True if the vehicle reports the end of the mission. A crashed vehicle may report it, too."""
-        if self._tracker.is_complete:
+        if self._tracker.is_present_plan_complete:
             return self._is_completion_final()
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
         if self._ending is Ending.RETURN and self._is_landing:
@@ -149,7 +149,7 @@ class MissionEndDetector:
         if self._ending is not Ending.UNKNOWN:
             return self._ending is not Ending.OTHER
         # The items are unknown, but the vehicle's mode after the completion shows whether it lands.
-        is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
+        is_complete, lands = self._tracker.is_present_plan_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
