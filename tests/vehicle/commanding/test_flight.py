@@ -861,21 +861,22 @@ async def test_set_home_without_requested_message_succeeds(flying: Flight, name:
         flying.copter.send_built(m.HomePosition.ID)
 
 
-async def test_set_home_waits_for_report_of_new_home(flying: Flight) -> None:
+async def test_set_home_waits_for_report_of_new_home() -> None:
     """A HOME_POSITION that is older than the order may arrive after the acknowledgement."""
-    copter, home = flying.copter, flying.vehicle.home.value
-    old_report = copter.build(m.HomePosition.ID)
-    assert old_report is not None
-    place = home.position.offset(north_m=30.0).replace(altitude_amsl_m=home.altitude_amsl_m)
-    copter.faults.refuse(MavCmd.REQUEST_MESSAGE)
-    copter.faults.lose(m.HomePosition)
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(flying.vehicle.set_home, place)
-        await anyio.sleep(1.0)
-        copter.send(old_report)
-        await anyio.sleep(1.0)
-        copter.send_built(m.HomePosition.ID)
-    assert flying.vehicle.home.value.position.distance_to(place) < 0.1
+    async with in_the_air(rates={}) as flying:  # HOME_POSITION is not streamed.
+        copter, home = flying.copter, flying.vehicle.home.value
+        old_report = copter.build(m.HomePosition.ID)
+        assert old_report is not None
+        place = home.position.offset(north_m=30.0).replace(altitude_amsl_m=home.altitude_amsl_m)
+        copter.faults.refuse(MavCmd.REQUEST_MESSAGE)
+        copter.faults.lose(m.HomePosition)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(flying.vehicle.set_home, place)
+            await anyio.sleep(1.0)
+            copter.send(old_report)
+            await anyio.sleep(1.0)
+            copter.send_built(m.HomePosition.ID)
+        assert flying.vehicle.home.value.position.distance_to(place) < 0.1
 
 
 async def test_take_off_reaches_its_altitude_when_home_is_moved(grounded: Flight) -> None:
@@ -901,6 +902,15 @@ async def test_flight_to_place_keeps_altitude_when_home_is_moved(flying: Flight,
         await vehicle.set_home(place)
     assert flying.copter.motion.north == pytest.approx(60.0, abs=2.5)
     assert -flying.copter.motion.down == pytest.approx(30.0, abs=2.5)
+
+
+async def test_home_moved_by_another_station_is_reported_despite_loss(flying: Flight) -> None:
+    copter = flying.copter
+    await anyio.sleep(5.0)
+    copter.faults.lose(m.HomePosition)
+    copter.navigation.set_home((300.0, 0.0, -30.0), lock=True)
+    await anyio.sleep(2.5)
+    assert flying.vehicle.home.value.north_m == pytest.approx(300.0)
 
 
 async def test_set_home_requests_lost_report_again(flying: Flight) -> None:

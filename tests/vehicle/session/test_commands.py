@@ -267,7 +267,7 @@ async def test_reboot_waits_for_return_and_resets_state(grounded: Flight) -> Non
         assert events.get_nowait() is None
     assert grounded.copter.uptime < 10.0
     await vehicle.wait_ready(timeout=30.0)
-    assert vehicle.version.is_known
+    await vehicle.version.wait_until(lambda _: True, timeout=5.0)
     rates = [
         command for command in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if command.param1 == m.Attitude.ID
     ]

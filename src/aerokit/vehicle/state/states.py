@@ -155,7 +155,8 @@ class States:
     )
     """Health of the state estimator (EKF_STATUS_REPORT, ESTIMATOR_STATUS)."""
 
-    home: StateField[Home] = StateField(MessageSource("HomePosition", movement.home), eager=True)
+    # ArduPilot itself sends the message only when home moves, and this one may be lost.
+    home: StateField[Home] = StateField(MessageSource("HomePosition", movement.home, hz=0.5), eager=True)
     """Home position: the place to return to (HOME_POSITION)."""
 
     origin: StateField[Position] = StateField(MessageSource("GpsGlobalOrigin", movement.origin), eager=True)
