@@ -616,6 +616,17 @@ async def test_fall_on_the_way_to_the_ground_is_rejected(name: str) -> None:
             await getattr(flight.vehicle, name)()
 
 
+@pytest.mark.parametrize("name", ["land", "return_to_launch"])
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_reboot_on_the_way_to_the_ground_is_rejected(opened: Any, name: str) -> None:
+    async with opened() as flight:
+        await flight.take_off(10.0)
+        simulated = flight.copter if isinstance(flight, Flight) else flight.px4
+        asyncio.get_running_loop().call_later(2.0, simulated.restart)
+        with pytest.raises(OperationRejected, match=f"^{name}: the vehicle rebooted"):
+            await getattr(flight.vehicle, name)()
+
+
 async def test_return_disarmed_while_climbing_is_rejected() -> None:
     """The vehicle rises for half a second, and then falls."""
     async with open_px4() as flight, anyio.create_task_group() as group:

@@ -148,6 +148,7 @@ class GroundCheck:
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
         self._impact = ImpactDetector(session.telemetry)
+        self._reboots_before = session.watch.reboots
         # Time of the report that the vehicle is on the ground, and altitude above sea level at that time.
         self._reported_at: float | None = None
         self._reported_altitude_m: float | None = None
@@ -178,18 +179,24 @@ class GroundCheck:
             self._reported_at = now
             self._settled_since = math.inf
             self._reported_altitude_m = self._impact.current_altitude()
-        return self._has_settled(now) and not self._impact.describe()
+        return self._has_settled(now) and not self._impact.describe() and not self._has_rebooted
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
         return self.fall() if self.is_reported_on_ground else in_flight()
 
     def fall(self) -> str | None:
         """Return a text if the vehicle fell or is falling."""
+        if self._has_rebooted:  # Its motors have stopped, and it reports neither its fall nor its former state.
+            return "the vehicle rebooted"
         telemetry = self._session.telemetry
         is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
         if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:
             return f"the vehicle was disarmed in the air and sinks at {self._down_m_s():.1f} m/s"
         return self._impact.describe() or None
+
+    @property
+    def _has_rebooted(self) -> bool:
+        return self._session.watch.reboots != self._reboots_before
 
     def _has_settled(self, now: float) -> bool:
         """Return True if the vehicle has stopped climbing or sinking."""
