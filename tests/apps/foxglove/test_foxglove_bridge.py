@@ -136,7 +136,8 @@ async def test_second_viewer_receives_current_values_of_all_vehicles() -> None:
         await first.read_until("/vehicle/1/home", "/vehicle/7/mode")
         async with viewing(bridge, "/home") as second:
             await second.read_until("/vehicle/1/home")
-            assert second.received["/vehicle/1/home"][0] == first.received["/vehicle/1/home"][0]
+            (_, home), (_, home_of_first) = (viewer.received["/vehicle/1/home"][0] for viewer in (second, first))
+            assert home == home_of_first
         assert list(bridge.vehicles) == [1, 7]
 
 
