@@ -4834,6 +4834,8 @@ class Vehicle(VehicleTwin):
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
         """Move the home position, and wait until HOME_POSITION reports it after the acknowledgement.
 
+        Then waits for the next position, so that ``vehicle.position`` has its altitude above the new home.
+
         While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as

@@ -862,6 +862,15 @@ async def test_set_home_at_position_and_elsewhere(flying: Flight) -> None:
     assert flying.vehicle.home.value.position.distance_to(place) < 0.1
 
 
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_position_after_set_home_has_altitude_above_new_home(opened: Any) -> None:
+    async with opened() as flight:
+        await flight.take_off(20.0)
+        vehicle, home = flight.vehicle, flight.vehicle.home.value
+        await vehicle.set_home(home.position.replace(altitude_amsl_m=home.altitude_amsl_m + 10.0))
+        assert vehicle.position.value.altitude_relative_m == pytest.approx(10.0, abs=1.0)
+
+
 @pytest.mark.parametrize("name", ["refuse", "ignore"])
 async def test_set_home_without_requested_message_succeeds(flying: Flight, name: str) -> None:
     """ArduPilot sends HOME_POSITION without a request, too."""
@@ -939,19 +948,20 @@ async def test_set_home_reports_home_that_stays(flying: Flight, monkeypatch: pyt
         await flying.vehicle.set_home(place)
 
 
-async def test_set_home_replaced_by_newer_one_is_rejected(flying: Flight) -> None:
-    copter, home = flying.copter, flying.vehicle.home.value
-    place = home.position.replace(altitude_amsl_m=home.altitude_amsl_m)
-    copter.faults.refuse(MavCmd.REQUEST_MESSAGE)
-    copter.faults.lose(m.HomePosition)
-    first = asyncio.ensure_future(flying.vehicle.set_home(place.offset(north_m=30.0)))
-    await anyio.sleep(0.5)
-    second = asyncio.ensure_future(flying.vehicle.set_home(place.offset(north_m=60.0)))
-    await anyio.sleep(0.5)
-    copter.send_built(m.HomePosition.ID)
-    await second
-    with pytest.raises(OperationRejected, match=r"^set_home: another order was given"):
-        await first
+async def test_set_home_replaced_by_newer_one_is_rejected() -> None:
+    async with in_the_air(rates={}) as flying:  # HOME_POSITION is not streamed.
+        copter, home = flying.copter, flying.vehicle.home.value
+        place = home.position.replace(altitude_amsl_m=home.altitude_amsl_m)
+        copter.faults.refuse(MavCmd.REQUEST_MESSAGE)
+        copter.faults.lose(m.HomePosition)
+        first = asyncio.ensure_future(flying.vehicle.set_home(place.offset(north_m=30.0)))
+        await anyio.sleep(0.5)
+        second = asyncio.ensure_future(flying.vehicle.set_home(place.offset(north_m=60.0)))
+        await anyio.sleep(0.5)
+        copter.send_built(m.HomePosition.ID)
+        await second
+        with pytest.raises(OperationRejected, match=r"^set_home: another order was given"):
+            await first
 
 
 async def test_set_home_is_not_replaced_by_refused_one(flying: Flight) -> None:

@@ -350,6 +350,8 @@ class TravelActions(VehicleBase):
     async def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
         """Move the home position, and wait until HOME_POSITION reports it after the acknowledgement.
 
+        Then waits for the next position, so that ``vehicle.position`` has its altitude above the new home.
+
         While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
@@ -397,6 +399,11 @@ class TravelActions(VehicleBase):
                 task.cancel()
         if not is_set(reported):
             raise OperationRejected(f"set_home: {SUPERSEDED}")
+        here, set_at = self.telemetry.position, home.updated_at
+        if here.age <= POSITION_MAX_AGE_S:
+            # The altitude of an older position is above the old home. `go_to` would order it above the new one.
+            with suppress(OperationTimeout):
+                await here.wait_until(lambda _: here.updated_at > set_at, timeout=POSITION_MAX_AGE_S)
 
     async def _send_home(self, home_order: Order, place: Position | Home | None) -> None:
         with self._arbiter.auxiliary_order(home_order) as order:
