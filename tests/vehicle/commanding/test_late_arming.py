@@ -11,7 +11,7 @@ from flight_harness import Flight, open_flight, open_px4, suspend_computer
 from aerokit.errors import AerokitError, CommandTimeout, OperationRejected, OperationTimeout
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
-from aerokit.mavlink.messages import CommandAck
+from aerokit.mavlink.messages import CommandAck, Heartbeat
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 
 ARM_WATCH_S = 15.0
@@ -380,6 +380,29 @@ async def test_disarm_before_answers_to_earlier_arm_is_repeated(grounded: Flight
     assert ordered(grounded) == [1, 0, 0]
     assert not grounded.copter.is_armed
     await asyncio.gather(arming, *([disarming] if disarming else []), return_exceptions=True)
+
+
+async def test_heartbeat_from_before_arming_does_not_report_disarming(grounded: Flight) -> None:
+    """The command to disarm is lost. A HEARTBEAT from before the arming and both answers to the arm arrive after it."""
+    vehicle, copter = grounded.vehicle, grounded.copter
+    copter.parameters["DISARM_DELAY"] = 0.0
+    await vehicle.set_mode("GUIDED")
+    old_heartbeat = copter.build(Heartbeat.ID)
+    assert old_heartbeat is not None
+    copter.faults.lose_ack(ARM)
+    arming = asyncio.create_task(vehicle.arm())
+    await anyio.sleep(0.05)
+    copter.faults.commands.clear()
+    copter.faults.ignore(ARM, times=1)
+    disarming = asyncio.create_task(vehicle.disarm())
+    while 0 not in ordered(grounded):  # noqa: ASYNC110
+        await anyio.sleep(0.01)
+    copter.send(old_heartbeat)
+    for _ in range(2):
+        copter.send(CommandAck(ARM, MavResult.ACCEPTED, target_system=255, target_component=190))
+    await disarming
+    assert not copter.is_armed
+    await asyncio.gather(arming, return_exceptions=True)
 
 
 async def after_heartbeat(flight: Flight) -> None:

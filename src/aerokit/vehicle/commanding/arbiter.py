@@ -68,7 +68,8 @@ class CommandArbiter:
         self._arming_accepted_at = -math.inf
         self.last_disarmed_report_at: float = -math.inf
         """Time of the last HEARTBEAT that reported disarmed."""
-        self._last_arming_at = -math.inf  # time of the last change from disarmed to armed
+        self.last_arming_at: float = -math.inf
+        """Time at which HEARTBEAT last changed from disarmed to armed; infinite after a reboot."""
         # An order without commands, which records a takeover or a failsafe since the program armed the vehicle. None if
         # another party has armed it.
         self._arming_order: Order | None = None
@@ -183,7 +184,7 @@ class CommandArbiter:
             order.on_reboot()
         self._ordered_since_disarmed.clear()
         self._arming_order = None
-        self._last_arming_at = math.inf  # Until the vehicle arms again, `current` ignores all orders.
+        self.last_arming_at = math.inf  # Until the vehicle arms again, `current` ignores all orders.
         self._arming_accepted_at = -math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
@@ -337,7 +338,7 @@ class CommandArbiter:
     def current(self) -> Order | None:
         """The newest steering order since the vehicle armed. If there is none, ``_arming_order``."""
         newest = self.newest
-        return newest if newest is not None and newest.given_at >= self._last_arming_at else self._arming_order
+        return newest if newest is not None and newest.given_at >= self.last_arming_at else self._arming_order
 
     def clear_failsafe(self) -> None:
         for order in (self.newest, self._arming_order):
@@ -492,7 +493,7 @@ class CommandArbiter:
             receiver.on_armed(armed, self._telemetry.armed.updated_at)
 
     def _on_arming(self) -> None:
-        self._last_arming_at = self._telemetry.armed.updated_at
+        self.last_arming_at = self._telemetry.armed.updated_at
         is_order_open = self.is_arm_command_open or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
         was_caused_by_order = was_accepted and was_armed_by_order(

@@ -251,13 +251,18 @@ class ArmingActions(VehicleBase):
         started = self.connection.now()
         with self._arbiter.auxiliary_order(ends_flight=True) as order:
             try:
-                accepted_at = await self._sender.send_disarm(order, force=force, timeout=timeout)
+                accepted = await self._sender.send_disarm(order, force=force, timeout=timeout)
             except CommandRejected as error:
                 # ArduCopter sends no status text when it refuses to disarm in the air (AP_Arming_Copter.cpp, disarm).
                 raise self._session.with_reasons(error, started, self._reason_if_flying()) from None
-            remaining_s = max(0.0, accepted_at + timeout - self.connection.now())
+            remaining_s = max(0.0, accepted.accepted_at + timeout - self.connection.now())
             await self._await_armed(
-                armed=False, order=order, started=started, timeout=remaining_s, max_silence_s=max_silence_s
+                armed=False,
+                order=order,
+                started=started,
+                reported_after=accepted.disarmed_after,
+                timeout=remaining_s,
+                max_silence_s=max_silence_s,
             )
 
     def _reason_if_flying(self) -> tuple[str, ...]:
@@ -267,9 +272,16 @@ class ArmingActions(VehicleBase):
         return (f"the vehicle is not on the ground (landed state {MavLandedState(landed).name})",)
 
     async def _await_armed(
-        self, *, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
+        self,
+        *,
+        armed: bool,
+        order: Order,
+        started: float,
+        timeout: float,
+        max_silence_s: float | None,
+        reported_after: float = -math.inf,
     ) -> None:
-        cell = self.telemetry.armed
+        cell, reported_after = self.telemetry.armed, max(started, reported_after)
 
         def failure_reason() -> str:
             if self._arbiter.last_arm_command is not armed:
@@ -280,7 +292,7 @@ class ArmingActions(VehicleBase):
         await await_progress(
             self._session,
             "arm()" if armed else "disarm()",
-            is_done=lambda: cell.latest is armed and cell.updated_at > started and self._arbiter.is_state_recent,
+            is_done=lambda: cell.latest is armed and cell.updated_at > reported_after and self._arbiter.is_state_recent,
             failure_reason=failure_reason,
             describe=lambda: "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text",
             timeout=timeout,

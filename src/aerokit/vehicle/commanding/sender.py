@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import anyio
 
@@ -66,6 +66,11 @@ def revoked_acceptance(operation: str, command: int, result: int) -> CommandReje
     error = rejection(command, result)
     error.args = (f"{operation}: {ACCEPTANCE_REVOKED}: {error}",)
     return error
+
+
+class AcceptedDisarm(NamedTuple):
+    accepted_at: float
+    disarmed_after: float  # Only a HEARTBEAT after this time proves by "disarmed" that the command was executed.
 
 
 class OrderSender:
@@ -183,33 +188,38 @@ class OrderSender:
         params = (float(armed), FORCE if force else 0)
         await self.send_long(order, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
 
-    async def send_disarm(self, order: Order, *, force: bool = False, timeout: float = math.inf) -> float:
-        """Send the command to disarm, and return the time of its acknowledgement.
+    async def send_disarm(self, order: Order, *, force: bool = False, timeout: float = math.inf) -> AcceptedDisarm:
+        """Send the command to disarm until it is acknowledged.
 
         On a link that duplicates frames, a second COMMAND_ACK of an earlier command to arm looks like the one of this
         command. If this is possible, wait for HEARTBEAT, at most ``timeout`` seconds. If it still reports armed, send
         the command once more.
         """
         armed, now = self._session.telemetry.armed, self._session.connection.now
-        started = now()
+        started, was_armed = now(), armed.latest
         may_be_answer_to_arm = self._may_be_answer_to_arm()
         await self.send_arm(order, armed=False, force=force)
         accepted_at = now()
         if not may_be_answer_to_arm:
-            return accepted_at
+            return AcceptedDisarm(accepted_at, started)
         effect_due_at = accepted_at + ARM_HEARTBEAT_DELAY_S
+
+        def disarmed_after() -> float:
+            # Until the arming itself is reported, a HEARTBEAT that reports disarmed may have been sent before it.
+            return started if was_armed or self._arbiter.last_arming_at > started else effect_due_at
+
         is_still_armed = False
         with suppress(OperationTimeout):
             is_still_armed = await armed.wait_until(
-                lambda is_armed: armed.updated_at > (effect_due_at if is_armed else started),
+                lambda is_armed: armed.updated_at > (effect_due_at if is_armed else disarmed_after()),
                 timeout=min(timeout, DISARM_REPORT_TIMEOUT_S),
             )
         is_current = self._arbiter.is_state_recent and not self._arbiter.slept_since(started)
         is_newest = self._arbiter.last_arm_command is False
         if is_still_armed and is_current and is_newest and not order.end:
             await self.send_arm(order, armed=False, force=force)
-            return now()
-        return accepted_at
+            accepted_at = now()
+        return AcceptedDisarm(accepted_at, disarmed_after())
 
     def _may_be_answer_to_arm(self) -> bool:
         """Return True if the next answer to a command to disarm may answer an earlier command to arm."""
