@@ -1,4 +1,4 @@
-"""``Core``: the connection and the received messages that the parts of a classic vehicle share."""
+"""``Core``: the connection and the received messages that the parts of a DroneKit `Vehicle` share."""
 
 from __future__ import annotations
 

@@ -278,9 +278,9 @@ class FleetAction:
 
     def _has_newer_order(self, member: Member) -> bool:
         """Return True if a newer action moves the member, or the program has told it to land or return."""
-        # If the action is a function of the program, this function may itself have ordered the landing.
-        is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
-        return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
+        # An action of kind OTHER is a function of the program, which may itself have ordered the landing.
+        may_be_own_landing = not self._moves_members and member.name not in self._outcomes
+        return (_is_ending_flight(member) and not may_be_own_landing) or self._has_newer_action(member)
 
     def _has_newer_action(self, member: Member) -> bool:
         """Return True if a newer action of the fleet moves the member or has moved it."""

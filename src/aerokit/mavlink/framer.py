@@ -251,7 +251,7 @@ class PythonFramer:
         examined_to = scan.examined_to
         pending: list[_Candidate] = []
         bad_crcs = list(scan.bad_crcs)
-        # These verdicts are placeholders: a candidate with an end of 0 is examined at once.
+        # The end 0 makes the loop examine these candidates, and replace the verdict `_NOISE`.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)

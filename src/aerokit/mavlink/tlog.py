@@ -23,7 +23,7 @@ _MAX_RECORD = 8 + 280
 # like such times. A record directly after another one may have any time, because the computer's clock may be wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
-# If the first two bytes of a time are not larger than these, the time is before _LAST_TIME.
+# A time whose first two bytes are at most these is before _LAST_TIME.
 _MAX_TIME_PREFIX = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]
 
 

@@ -106,10 +106,12 @@ STATUS_HZ = 5.0
 
 
 def _check_instance(services: ComponentServices, instance: float | None) -> None:
-    # A command to all components may be meant for another one. Our only device has number 1, or the number of the
-    # component id, and 0 means all devices (DO_GRIPPER in common.xml).
-    if instance not in (None, 0, 1, services.host.component_id):
-        raise InvalidArgument(f"instance = {instance} is not allowed: this component has only number 1")
+    # 0 means all devices, and a component id the device with this id (DO_GRIPPER in common.xml).
+    component_id = services.host.component_id
+    if instance not in (None, 0, 1, component_id):
+        raise InvalidArgument(
+            f"instance = {instance} is not allowed: the only device of this component is 1, or {component_id}"
+        )
 
 
 def add_winch(services: ComponentServices, winch: WinchDriver) -> None:

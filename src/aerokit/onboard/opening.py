@@ -77,7 +77,7 @@ async def component(
         record: ``.tlog`` file for all traffic.
         reconnect: True to reopen a lost link instead of ending the connection.
         peers: IP addresses and networks to accept, for links with an open port.
-        may_move: True to accept a silent sender from another IP address.
+        may_move: True to accept a sender that fell silent and returns from another IP address.
 
     Raises:
         InvalidArgument: an argument is not allowed; nothing was opened.

@@ -47,9 +47,10 @@ class _Request:
 class RequestWindow(Generic[KeyT]):
     """Requests, each identified by a key, with a limit on the number in flight.
 
-    The limit is ``size`` at first, and grows while answers do not become slower. A request is repeated when its answer
-    is overdue (:class:`RoundTrip`), or when later requests were answered first. With ``duplicate_last``, the last few
-    requests are sent twice from their third attempt on.
+    The limit is ``size`` at first, and grows while answers do not become slower. A request is repeated when its
+    answer is overdue (:class:`RoundTrip`), or when later requests were answered first. With ``duplicate_last``,
+    when only a few requests of the transfer are left, each of their attempts after the second is sent as two
+    copies.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:

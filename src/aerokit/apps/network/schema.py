@@ -124,10 +124,7 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
 
 
 def _enum_schema(name: str) -> dict[str, Any] | None:
-    """Return the JSON schema of a value that is an enum; None if ``ENUMS`` does not list its name.
-
-    The name is that of a state, or ``Class.field``.
-    """
+    """Return the JSON schema of a state, or of a field by ``Class.field``, that is an enum; None if it is no enum."""
     enum = ENUMS.get(name)
     if enum is None:
         return None
