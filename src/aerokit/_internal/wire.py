@@ -46,7 +46,7 @@ class _CounterFields:
 
 
 class Copyable:
-    """Makes objects with compiled fields copyable and picklable."""
+    """Makes objects copyable and picklable whose fields are defined in the compiled extension."""
 
     __slots__ = ()
 

@@ -482,7 +482,7 @@ class Autopilot:
     """
 
     has_vtols: bool = True
-    """False if EXTENDED_SYS_STATE may report a VTOL state although no vehicle of the firmware is a VTOL."""
+    """False if the firmware flies no VTOLs, so that a VTOL state in its EXTENDED_SYS_STATE must be ignored."""
     reports_gripper_by_text: bool = False
     """True if a status text reports the end of a gripper's movement, False if the acknowledgement reports it."""
     highres_imu_field_ut: float = 100.0

@@ -166,7 +166,8 @@ class FleetAction:
             await tasks.aclose()
         if self.program_error is not None:
             self._hold_finished_members()
-            await asyncio.sleep(0)  # The commands to hold must be sent before the error can end the fleet.
+            # Let the tasks that order the holds run, before the error leaves the `async with` block of the fleet.
+            await asyncio.sleep(0)
             raise self.program_error
         return self.result_so_far()
 
@@ -262,7 +263,7 @@ class FleetAction:
         await anyio.sleep(delay_s)
         await member.vehicle._sender.await_recent_state()
         if connection._slept_since(began_at) > 0:
-            raise OperationRejected(f"{self.name}: the computer slept before {name} started; nothing was sent to it")
+            raise OperationRejected(f"{self.name}: the computer slept before {name} started; no order was sent")
         member.refresh()
         if not member.is_available:
             raise OperationRejected(f"{self.name}: {name} is {member.status}")

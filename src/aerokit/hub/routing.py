@@ -401,7 +401,8 @@ class Router(Generic[PortT]):
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None
         if target is not None:
-            # A sender's message to itself is not forwarded, because the caller removes the port where it arrived.
+            # A sender's message to itself goes nowhere, because the caller removes the port at which it arrived. An
+            # empty result would count as an error: no route.
             return {ingress_number: None} if target is origin else dict.fromkeys(target.destinations)
         # A message for an unknown component goes to its whole system.
         members = [sender for sender in self._senders.values() if sender.system_id == system_id]

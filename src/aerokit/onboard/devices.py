@@ -106,7 +106,7 @@ STATUS_HZ = 5.0
 
 
 def _check_instance(services: ComponentServices, instance: float | None) -> None:
-    # 0 means all devices, and a component id the device with this id (DO_GRIPPER in common.xml).
+    # DO_GRIPPER in common.xml: the instance is a number from 1 on, or a component id; 0 means all instances.
     component_id = services.host.component_id
     if instance not in (None, 0, 1, component_id):
         raise InvalidArgument(

@@ -13,7 +13,8 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 
 # ArduPilot queues 20 PARAM_REQUEST_READ and drops further ones.
 DEFAULT_SIZE = 20
-# The window grows to at most this many times its initial size.
+# The window grows to at most this many times its initial size. On slow links, most of the requests are in transit, so
+# that the vehicle's queue does not overflow.
 MAX_GROWTH = 5
 # An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02

@@ -54,7 +54,8 @@ class SimulatedLog:
 class LogServer:
     """Sends lists and contents of logs at ``rate_hz`` messages per second, in groups of ``burst`` messages.
 
-    The server makes one transfer at a time. Subclasses implement what differs between autopilots.
+    The server makes one transfer at a time. Subclasses implement what differs between autopilots. If the logs are also
+    files on the vehicle, ``erase_files`` and ``append_to_file`` keep these files equal to the logs.
     """
 
     burst = 10

@@ -387,7 +387,7 @@ class Motion:
     def _lean(self, north: float, east: float, dt: float, *, powered: bool) -> None:
         roll = pitch = 0.0
         if powered and not self.is_on_ground:
-            # The copter also leans against its drag.
+            # The thrust must also overcome the drag; `_drag` returns this acceleration.
             drag_north, drag_east = self._drag()
             north += drag_north
             east += drag_east

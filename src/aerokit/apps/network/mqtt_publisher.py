@@ -286,14 +286,15 @@ class _LinkPublisher(Publisher):
 async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
     """Connect to an MQTT broker while the block lasts.
 
-    States are published to the topics ``aerokit/FLEET/NAME/state/…``, with QoS 0, not retained.
+    FLEET and NAME are the last two parts of the address, for example ``fleet`` and ``alpha`` in
+    ``mqtt://10.0.0.5:1883/fleet/alpha``. States are published to ``aerokit/FLEET/NAME/state/…`` (QoS 0, not retained).
     ``aerokit/FLEET/NAME/alive`` is retained. It is "online" within the block, and "offline" after the block or after
     the broker has lost the connection. A lost connection is reopened; values published meanwhile are dropped. The event
     loop must support ``add_reader``; on Windows, only ``asyncio.SelectorEventLoop`` does.
 
     Args:
-        address: ``"mqtt://10.0.0.5:1883/fleet/alpha"`` or ``"mqtt://user:password@…"``; with ``mqtts`` instead of
-            ``mqtt`` for TLS (port 8883).
+        address: ``"mqtt://HOST:PORT/FLEET/NAME"`` or ``"mqtt://user:password@…"``; with ``mqtts`` instead of ``mqtt``
+            for TLS (port 8883).
 
     Returns:
         A publisher for :func:`publishing`.

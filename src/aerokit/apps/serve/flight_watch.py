@@ -35,8 +35,8 @@ CRASH_STILL_HEIGHT_M = 2.5
 """A vehicle that lies still may report heights that differ by this much from that at the impact. PX4's estimate jumps
 by up to 2 m in the 5 s after an impact."""
 CRASH_STOP_M_S2 = 20.0
-"""If a vehicle still reports that it flies, it must also have stopped with this deceleration, which motors do not reach
-close to the ground."""
+"""If a vehicle still reports that it flies, it counts as crashed only if it stopped with this deceleration. Motors do
+not reach it close to the ground."""
 CRASH_ARMED_WITHIN_S = 30.0
 """Impacts count only if the vehicle was armed in this many seconds before. Estimates of other vehicles may jump, for
 example after a reboot."""

@@ -210,7 +210,8 @@ class CaptureLog:
         ``previous`` is the stored entry with the same index.
         """
         if previous is not None and previous.capture.success is not False:
-            return not entry.reports_same_picture(previous)  # Two successful pictures cannot have the same index.
+            # Both entries have the same index. The camera gives it to another picture only if it counts from 0 again.
+            return not entry.reports_same_picture(previous)
         # A new picture with a lower index shows a reset. A capture that was requested or arrived late may have a lower
         # index without a reset.
         index, highest = entry.capture.index, self._highest

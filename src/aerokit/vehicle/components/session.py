@@ -214,8 +214,8 @@ class _WebDownload:
                     content += block
                     if len(content) > MAX_FILE_SIZE:
                         raise file_too_large(self._uri)
-                if answer.length:  # Not all bytes that Content-Length announced have arrived.
-                    raise OSError(f"{answer.length} bytes are missing")
+                if missing := answer.length:  # number of bytes that Content-Length announced, but that did not arrive
+                    raise OSError(f"the server closed the connection {missing} bytes before the end of the file")
                 return bytes(content)
         except (InvalidArgument, FileFormatError):  # Both are ValueErrors. The next clause must not catch them.
             raise

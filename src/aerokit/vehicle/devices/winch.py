@@ -67,8 +67,8 @@ class Winch(ReadOnly):
         """Pay out a length of line, and return when WINCH_STATUS reports it within 0.1 m.
 
         Returns at the acknowledgement if the winch sends no WINCH_STATUS. The command is sent once, because a second
-        one would pay out more line. If the winch is turning already, it adds the length to that at which the command
-        arrives, and the call returns when the winch has stopped there.
+        one would pay out more line. The length counts from the moment at which the winch gets the command. If it is
+        turning at that moment, the call returns when it has stopped.
 
         Args:
             length_m: metres, −1000 to 1000; negative values wind the line up.

@@ -303,7 +303,7 @@ class ParameterWriter:
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
         """Send the planned values. The answers are keyed by the names on the vehicle."""
-        if upload is None:  # `ParameterWrites` sends each name once, even if two plans have it.
+        if upload is None:  # `write` sends each name once, even if two plans have it, and skips no unchanged value.
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
         # Two names may mean the same parameter, which must be in the file only once.
         changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}.values()
