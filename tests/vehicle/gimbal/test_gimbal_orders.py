@@ -188,7 +188,7 @@ async def test_late_denial_ends_only_the_newest_wait_of_a_manager() -> None:
         assert ends == {2: CommandRejected, 1: OperationTimeout}
 
 
-async def test_late_denial_and_newer_order_leave_older_wait_of_a_manager() -> None:
+async def test_late_denial_and_newer_order_leave_older_wait() -> None:
     """The newer order claims control and forgets the denial; the answer to it takes longer than a check."""
     async with mounted() as flight:
         flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
