@@ -181,7 +181,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
 
 
 # Seconds after the first PARAM_SET in which old values may still arrive, as late answers to earlier requests.
-LATE_ANSWERS_S = 1.0
+LATE_ANSWERS_S = 1.5
 # Maximum number of writes in flight. ArduPilot saves through a queue of 30, which must not overflow while armed.
 WRITE_WINDOW = 10
 
@@ -194,7 +194,7 @@ class ParameterWrites(ParameterRequests):
     - The requested value with the requested type: the write is complete.
     - No answer: the value is read.
     - The old value: PARAM_SET is sent again, because it may have been lost. If the vehicle reports the old value eight
-      times in a row, and still after a second, it is the result. While the old value is unknown, every unexpected value
+      times in a row, and still after 1.5 s, it is the result. While the old value is unknown, every unexpected value
       is treated like the old value.
     - Another value: the value is read again. PARAM_SET is not sent again, because it would undo the change if another
       station has set the value. A value reported twice in a row is the result.
