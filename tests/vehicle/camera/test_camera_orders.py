@@ -468,7 +468,7 @@ async def guessed_camera(kind: Any = SimulatedCopter) -> AsyncIterator[tuple[Any
     """A vehicle, and a camera that is not found: ``vehicle.camera`` stands for a camera of the autopilot."""
     camera = SimulatedCamera()
     camera.faults.heartbeats_stopped = True
-    open_any = open_px4 if kind is SimulatedPx4 else open_flight
+    open_any: Any = open_px4 if kind is SimulatedPx4 else open_flight
     async with open_any(kind(boot_time_s=0.0, components=[camera])) as flight:
         with pytest.raises(OperationTimeout, match="did not identify itself"):
             await flight.vehicle.camera.wait_found()

@@ -461,10 +461,10 @@ async def test_rates_after_zero_rate_end_despite_lost_message() -> None:
         with suppress(Boom):
             async with flight.vehicle.gimbal.rates(-5.0, 10.0):
                 await anyio.sleep(0.5)
-                late = flight.wire.all(m.GimbalManagerSetPitchyaw)[-1]
                 flight.copter.observe(m.GimbalManagerSetPitchyaw, lambda *_: final_message.set())
                 raise Boom
         await final_message.wait()
+        late, *_ = flight.wire.all(m.GimbalManagerSetPitchyaw)
         flight.copter.receive(FrameEncoder(*own_ids(flight)).encode(late), flight.copter.now)
         gimbal.faults.drop_incoming = 2
         await anyio.sleep(2.0)
