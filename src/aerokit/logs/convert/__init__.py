@@ -113,7 +113,7 @@ def convert(
     if target_path.exists() and target_path.is_dir() != is_folder:
         existing, new = ("file", "folder") if is_folder else ("folder", "file")
         raise InvalidArgument(f"{target_path} is a {existing} and cannot be replaced by a {new}")
-    on_bytes = progress_callback(source, on_progress)
+    on_bytes = progress_callback(source.stat().st_size, on_progress)
     # The temporary folder is in the target's directory, because renaming works only within one file system.
     with tempfile.TemporaryDirectory(dir=target_path.parent, prefix=f".{target_path.name}.") as folder:
         incomplete = Path(folder) / target_path.name

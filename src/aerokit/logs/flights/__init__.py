@@ -63,9 +63,9 @@ def check_log_name(path: Path) -> None:
         raise FileFormatError(f"{path} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
 
 
-def progress_callback(path: Path, on_progress: OnProgress | None) -> Callable[[int], object]:
-    """Return a function that reports the number of bytes read so far to ``on_progress``."""
-    total, started = path.stat().st_size, time.monotonic()
+def progress_callback(total: int, on_progress: OnProgress | None) -> Callable[[int], object]:
+    """Return a function that reports how many of ``total`` bytes were read so far to ``on_progress``."""
+    started = time.monotonic()
     if on_progress is None:
         return lambda done: None
     return lambda done: on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
@@ -91,12 +91,13 @@ def read_flight(
     path = Path(log)
     check_log_name(path)
     read = LOG_READERS[path.suffix.lower()]
-    report_progress = progress_callback(path, on_progress)
+    size = path.stat().st_size
+    report_progress = progress_callback(size, on_progress)
     report_progress(0)
     flight = FlightLog(path)
     read(flight, system_id, report_progress)
     _complete(flight)
-    report_progress(path.stat().st_size)
+    report_progress(size)
     return flight
 
 

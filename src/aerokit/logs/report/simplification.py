@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -15,6 +15,18 @@ if TYPE_CHECKING:
 _MAX_SEGMENT = 1024
 MAX_COORDINATE = 1e9
 """Larger coordinates are damaged data. They are ignored, because their squares could overflow."""
+
+
+class _Segment(NamedTuple):
+    """A line segment from the point ``first`` to the point ``last``, which replaces the points between them.
+
+    heapq returns the smallest item first, so the square of the largest deviation is negative.
+    """
+
+    negative_square: float
+    farthest: int  # index of the point with the largest deviation
+    first: int
+    last: int
 
 
 def simplify(
@@ -63,16 +75,11 @@ def simplify(
                 heapq.heappush(segments, _segment(places, begin, end))
     largest_deviation = 0.0
     if segments:
-        negative_square, *_ = segments[0]
-        largest_deviation = math.sqrt(-negative_square)
+        largest_deviation = math.sqrt(-segments[0].negative_square)
     return sorted({*selected, *gaps}), largest_deviation
 
 
-def _segment(places: Sequence[tuple[float, float]], first: int, last: int) -> tuple[float, int, int, int]:
-    """Return the largest deviation of the points between two points from a line, the index of that point, and the two.
-
-    The deviation is squared, and negative, because heapq returns the smallest item first.
-    """
+def _segment(places: Sequence[tuple[float, float]], first: int, last: int) -> _Segment:
     x, y = places[first]
     last_x, last_y = places[last]
     segment_x, segment_y = last_x - x, last_y - y
@@ -88,4 +95,4 @@ def _segment(places: Sequence[tuple[float, float]], first: int, last: int) -> tu
         squared_distance = dx * dx + dy * dy
         if squared_distance > largest:
             largest, largest_index = squared_distance, index
-    return -largest, largest_index, first, last
+    return _Segment(-largest, largest_index, first, last)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
@@ -17,7 +17,8 @@ from aerokit.protocols.command import command_name
 from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable
+    from contextlib import AbstractContextManager
 
     from aerokit.connection.bus import Detach
     from aerokit.connection.cells import StateCell
@@ -110,28 +111,22 @@ class CameraOrders:
         return ("camera", self.component.component_id, self.device_id, subject)
 
     def begin_order(self, subject: str) -> Order:
-        topic = self.topic(subject)
-        self._ordered_topics.add(topic)
-        return self._context.arbiter.device_order(topic, may_be_withdrawn=True)
+        return self._context.arbiter.device_order(self._ordered_topic(subject), may_be_withdrawn=True)
 
     def latest_order(self, subject: str) -> Order | None:
         return self._context.arbiter.latest(self.topic(subject))
 
-    @contextmanager
-    def new_order(self, subject: str) -> Iterator[Order]:
-        """Begin an order. If the block raises, the order is withdrawn.
+    def new_order(self, subject: str) -> AbstractContextManager[Order]:
+        """Begin an order for a `with` block. If the block raises, the order is withdrawn.
 
         During the block, no camera that is found late takes the place of a guess.
         """
-        order = self.begin_order(subject)
-        try:
-            yield order
-        except BaseException:
-            # An order that was refused or not answered does not count, so the previous one is valid again
-            # (docs/reliability.md).
-            order.withdraw()
-            raise
-        order.commit()
+        return self._context.arbiter.withdrawable_order(self._ordered_topic(subject))
+
+    def _ordered_topic(self, subject: str) -> Topic:
+        topic = self.topic(subject)
+        self._ordered_topics.add(topic)
+        return topic
 
     async def command(
         self,

@@ -132,6 +132,19 @@ class CommandArbiter:
         self._register(order, (topic,))
         return order
 
+    @contextmanager
+    def withdrawable_order(self, topic: Topic) -> Iterator[Order]:
+        """Create an order about a device for a `with` block. If the block raises, the order is withdrawn."""
+        order = self.device_order(topic, may_be_withdrawn=True)
+        try:
+            yield order
+        except BaseException:
+            # An order that was refused or not answered does not count, so the previous one is valid again
+            # (docs/reliability.md).
+            order.withdraw()
+            raise
+        order.commit()
+
     # ------------------------------------------------------------------------------- steering
 
     def order(

@@ -374,13 +374,9 @@ class TravelActions(VehicleBase):
             raise InvalidArgument(
                 "place.altitude_amsl_m = None is not allowed: home needs an altitude above mean sea level"
             )
-        home, home_order = self.telemetry.home, self._arbiter.device_order(HOME, may_be_withdrawn=True)
-        try:
+        home = self.telemetry.home
+        with self._arbiter.withdrawable_order(HOME) as home_order:
             await self._send_home(home_order, place)
-        except BaseException:
-            home_order.withdraw()  # A call that was refused or not answered does not replace an earlier one.
-            raise
-        home_order.commit()
         acknowledged_at = self.connection.now()
 
         def is_set(reported: Home) -> bool:
