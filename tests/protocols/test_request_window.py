@@ -34,6 +34,13 @@ def test_discarded_request_is_not_in_flight() -> None:
     assert window.take_due(10.0) == [1]
 
 
+def test_answer_faster_than_link_is_not_measured() -> None:
+    round_trip = RoundTrip(link_s=lambda: 0.6)
+    for seconds in (0.7, 0.01, 0.7, 0.02):
+        round_trip.add_sample(seconds)
+    assert (round_trip.smoothed_s, round_trip.fastest_s) == (0.7, 0.7)
+
+
 def test_request_timeout_is_capped() -> None:
     round_trip = RoundTrip(3.0)
     assert round_trip.timeout_s() > MAX_TIMEOUT_S

@@ -113,6 +113,9 @@ INITIAL_TIMEOUT_S = 1.0
 # Minimum jitter of answers, caused by the vehicle's main loop and the resolution of the clock.
 JITTER_S = 0.03
 
+# An answer that arrives sooner than this fraction of a known round trip belongs to an earlier request.
+MIN_ROUND_TRIP_FRACTION = 0.5
+
 BACKOFF = 1.5  # From the third attempt on, each attempt waits longer than the previous one by this factor.
 MAX_BACKOFFS = 30  # Maximum exponent of BACKOFF, because a higher power could overflow.
 
@@ -121,21 +124,32 @@ class RoundTrip:
     """Smoothed round-trip time to one vehicle, shared by its transfers.
 
     Only answers to requests that were sent once are measured (Karn's algorithm), because an answer after a retry may
-    belong to either transmission.
+    belong to either transmission. ``link_s`` returns the link's latest round-trip time as TIMESYNC measures it, or
+    None. A much shorter time is not measured, because the answer must belong to an earlier request.
     """
 
-    def __init__(self, initial_s: float | None = None, *, min_s: float = 0.05, max_s: float = 2.0) -> None:
+    def __init__(
+        self,
+        initial_s: float | None = None,
+        *,
+        min_s: float = 0.05,
+        max_s: float = 2.0,
+        link_s: Callable[[], float | None] = lambda: None,
+    ) -> None:
         self.smoothed_s: float | None = None
         """Smoothed round-trip time in seconds; None before the first measurement."""
         self.fastest_s: float | None = None
         """The shortest round-trip time so far, in seconds."""
         self._deviation_s = 0.0
         self._min_s, self._max_s = min_s, max_s
+        self.link_s = link_s
         if initial_s is not None:
             self.add_sample(initial_s)
 
     def add_sample(self, seconds: float) -> None:
         """Record the time from a request that was sent once to its answer."""
+        if seconds < MIN_ROUND_TRIP_FRACTION * (self.link_s() or 0.0):
+            return
         self.fastest_s = seconds if self.fastest_s is None else min(self.fastest_s, seconds)
         if self.smoothed_s is None:
             self.smoothed_s = seconds
@@ -323,9 +337,6 @@ class Transfer(Exchange[ResultT]):
         frame = message.received_frame
         return frame is None or (frame.system_id == self.target_system and frame.component_id == self.target_component)
 
-
-# An answer that arrives sooner than this fraction of the fastest round trip so far belongs to an earlier request.
-MIN_ROUND_TRIP_FRACTION = 0.5
 
 # For each name, early answers to at most this many requests are refused. Without this limit, all answers of a vehicle
 # that has become faster would be refused until the idle timeout.

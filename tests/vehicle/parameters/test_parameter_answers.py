@@ -7,7 +7,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Flight
+from flight_harness import Flight, open_flight
 
 from aerokit.errors import OperationTimeout, ParameterRejected, ParameterTimeout
 from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamSet, ParamValue
@@ -158,3 +158,16 @@ async def test_echo_of_cancelled_write_confirms_nothing(grounded: Flight) -> Non
         await parameters.set("LAND_SPEED", 61, timeout=0.01)
     assert (await parameters.set("LAND_SPEED", 61)).outcome == "set"
     assert copter.parameters["LAND_SPEED"] == 61
+
+
+async def test_reads_after_early_answers_wait_for_slow_link() -> None:
+    async with open_flight(latency_s=0.15) as flight:
+        copter, parameters = flight.copter, flight.vehicle.parameters
+        await anyio.sleep(3.0)
+        for _ in range(20):  # Each answer leaves the vehicle before the request, and arrives after it.
+            copter.send(ParamValue("RTL_ALT", 1500, ParameterType.REAL32, 1, 0))
+            await anyio.sleep(0.14)
+            await parameters.get("RTL_ALT")
+        flight.wire.clear()
+        await parameters.get("WPNAV_SPEED")
+        assert len(set(flight.wire.times(ParamRequestRead))) == 1

@@ -67,8 +67,9 @@ class ParameterAccess:
     @property
     def _read_round_trip(self) -> RoundTrip:
         if self._cached_read_round_trip is None:
-            link_s = self._transfers.round_trip.smoothed_s
-            self._cached_read_round_trip = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
+            shared = self._transfers.round_trip
+            initial_s = None if shared.smoothed_s is None else shared.smoothed_s + ANSWER_DELAY_S
+            self._cached_read_round_trip = RoundTrip(initial_s, link_s=shared.link_s)
         return self._cached_read_round_trip
 
     @property

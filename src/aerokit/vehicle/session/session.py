@@ -37,6 +37,7 @@ from aerokit.mavlink.messages import (
     HomePosition,
 )
 from aerokit.protocols.command import MAX_HEARTBEAT_AGE_S
+from aerokit.protocols.exchange import RoundTrip
 from aerokit.vehicle.session.commands import CommandSender
 from aerokit.vehicle.session.rates import MessageRates
 from aerokit.vehicle.session.subscriber import ComponentSubscriber, WatchedStream
@@ -178,6 +179,7 @@ class VehicleSession:
             end=self.end,
             describe=self.describe_link,
             round_trip_s=lambda: self.link_watch.round_trip_s,
+            round_trip=RoundTrip(link_s=lambda: self.link_watch.round_trip_s),
             send_command=self.commands.send_long,
         )
         self.is_closed: bool = False

@@ -71,6 +71,7 @@ class Transfers:
         end: EndSignal,
         describe: Callable[[], str],
         round_trip_s: Callable[[], float | None] = lambda: None,
+        round_trip: RoundTrip | None = None,
         send_command: Callable[..., Awaitable[object]] | None = None,
         request_version: Callable[[], Awaitable[object]] | None = None,
     ) -> None:
@@ -84,8 +85,7 @@ class Transfers:
         self.component_id: int = component_id
         self.autopilot = autopilot
         self.background = background
-        self.round_trip: RoundTrip = RoundTrip()
-        """Round-trip time: measured by TIMESYNC at first, and by transfers from the first one on."""
+        self._round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip
         self._end = end
         # True once a component has not answered the request for its version.
         self._is_version_unavailable = False
@@ -96,6 +96,15 @@ class Transfers:
         self._describe = describe
         self._round_trip_s = round_trip_s
 
+    @property
+    def round_trip(self) -> RoundTrip:
+        """Round-trip time: measured by TIMESYNC at first, and by transfers from the first one on."""
+        if self._round_trip.smoothed_s is None:
+            seconds = self._round_trip_s()
+            if seconds is not None:
+                self._round_trip.add_sample(seconds)
+        return self._round_trip
+
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
 
@@ -104,7 +113,6 @@ class Transfers:
         """
         self._end.raise_if_ended()
         with self.limit(timeout), anyio.CancelScope() as scope:
-            self._init_round_trip()
             if isinstance(exchange, Transfer) and exchange.on_progress is not None:
                 exchange.on_progress = _without_errors(exchange.on_progress)
             detach = self._end.on_end(lambda _: scope.cancel())
@@ -125,14 +133,6 @@ class Transfers:
 
     def _explain(self, error: OperationTimeout) -> None:
         error.args = (f"{error}; {self._describe()}",)
-
-    def _init_round_trip(self) -> None:
-        if self.round_trip.smoothed_s is not None:
-            return
-        # The round trip of TIMESYNC is the first sample.
-        seconds = self._round_trip_s()
-        if seconds is not None:
-            self.round_trip.add_sample(seconds)
 
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
