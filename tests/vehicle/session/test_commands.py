@@ -228,6 +228,22 @@ async def test_ack_for_another_station_leaves_late_ack_expected(grounded: Flight
             await grounded.vehicle.command(question, m.HomePosition.ID)
 
 
+async def test_copy_of_ack_does_not_acknowledge_next_command(grounded: Flight) -> None:
+    ack = await grounded.vehicle.command(SERVO, 9, 1900)
+    assert ack.received_frame is not None
+    grounded.copter.faults.ignore(SERVO)
+
+    async def deliver_copy() -> None:
+        await anyio.sleep(0.1)
+        assert ack.received_frame is not None
+        grounded.wire.deliver(ack.received_frame.raw)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(deliver_copy)
+        with pytest.raises(CommandTimeout):
+            await grounded.vehicle.command(SERVO, 9, 1100)
+
+
 async def test_command_connection_ends_raises(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     async with anyio.create_task_group() as tasks:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections import defaultdict
+from collections import defaultdict, deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.connection.exchanges import ExchangeRun
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from aerokit.connection.connection import Connection
+    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.messages import CommandInt, CommandLong
     from aerokit.protocols.command import OrderStatus
 
@@ -28,6 +29,10 @@ MIN_ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
 """An ack is considered lost this many seconds after the end of the call that expected it."""
+# An ack is a copy if an equal frame arrived at most this long before. The frames have equal sequence numbers, and these
+# repeat after 256 frames, so that a new ack is equal by chance only if the vehicle sends more than 256 frames a second.
+COPY_WINDOW_S = 1.0
+MAX_RECENT_ACKS = 16
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""
@@ -89,6 +94,7 @@ class CommandSender:
         self._refused_at: dict[_Key, float] = {}
         # The last refusal of each command that arrived when no ack was expected.
         self._late_refusals: dict[_Key, _LateRefusal] = {}
+        self._recent_acks: deque[Frame] = deque(maxlen=MAX_RECENT_ACKS)
         self._is_closed = False
         self._detach_callbacks = (
             connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
@@ -319,9 +325,18 @@ class CommandSender:
         elif self._is_for_our_ids(ack):
             self._accepted_at[key] = self._connection.now()
 
+    def _is_copy(self, frame: Frame) -> bool:
+        """Record an ack's frame. Return True if an equal frame has just arrived, because the link duplicates frames."""
+        earliest = frame.received_at - COPY_WINDOW_S
+        is_copy = any(ack.body == frame.body and ack.received_at >= earliest for ack in self._recent_acks)
+        self._recent_acks.append(frame)
+        return is_copy
+
     def _on_ack(self, ack: CommandAck) -> None:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
+        if frame is not None and self._is_copy(frame):
+            return  # Otherwise the next command with this MAV_CMD would count as acknowledged, even if it was lost.
         run = self._runs.get(key)
         is_final = ack.result != MavResult.IN_PROGRESS
         is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
