@@ -147,13 +147,14 @@ class ManeuverActions(VehicleBase):
             check_range("rounds", rounds, 0, MAX_ROUNDS, above=True)
             if rounds * 2 != int(rounds * 2):
                 raise InvalidArgument(f"rounds = {rounds!r} is not allowed: it must be a multiple of 0.5")
-        is_flown_by_px4 = self._is_on_wings and self.autopilot.circles_by == "orbit"
-        if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
+        has_command = self._is_on_wings and self.autopilot.circles_by == "orbit"  # a PX4 fixed wing
+        has_setpoints = not self._is_on_wings and self.autopilot.setpoints.trajectory
+        if not (has_command or has_setpoints):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
         counter = LobeCounter(major_radius_m, axis_deg)
         limits = FlightLimits(max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "figure_eight", travel_target(center), counter, rounds, limits)
-        if is_flown_by_px4:
+        if has_command:
             major_m = major_radius_m if clockwise else -major_radius_m
             axis_rad = math.radians(math.remainder(axis_deg, 360))  # The command allows -pi to pi.
             params = (major_m, minor_radius_m, math.nan, axis_rad)

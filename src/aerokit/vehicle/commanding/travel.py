@@ -116,8 +116,8 @@ class TravelActions(VehicleBase):
             OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
         target = travel_target(target)
-        place = self._position.command_place(target)
-        target = self._position.as_ordered(target)
+        place = self._position.command_int_place(target)
+        target = self._position.with_sent_altitude(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m)
         self._position.check_reach("target", [target], max_distance_m)
         arrival_radius_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
@@ -130,8 +130,8 @@ class TravelActions(VehicleBase):
         try:
             with self._flight_cleanup.flying(order):
                 unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
-                if unacknowledged_target is None:  # Otherwise the vehicle converts the altitude at each repetition.
-                    target = self._position.as_accepted(target)
+                if unacknowledged_target is None:  # The vehicle has converted the altitude, and keeps the result.
+                    target = self._position.with_amsl_altitude(target)
                 is_incomplete = True
                 if speed_m_s is not None and not self._speeds_by_reposition:
                     # ArduPilot applies the speed only once the vehicle is on its way.
@@ -476,7 +476,7 @@ class LookActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
-        place = self._position.command_place(position_with_altitude(target))
+        place = self._position.command_int_place(position_with_altitude(target))
         if not self._session.commands.is_unsupported(ROI_LOCATION) and await self._set_roi_location(place):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
