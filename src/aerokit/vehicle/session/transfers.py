@@ -128,7 +128,7 @@ class Transfers:
                     if isinstance(answer, OperationTimeout):
                         self._explain(answer)
             return result
-        self._end.raise_if_ended()
+        self._end.raise_if_ended()  # Only the end of the session cancels `scope`.
         raise AssertionError("the exchange was cancelled, but the session has not ended")
 
     def _explain(self, error: OperationTimeout) -> None:
