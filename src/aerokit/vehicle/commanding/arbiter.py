@@ -252,7 +252,8 @@ class CommandArbiter:
         if armed is not None:
             self._supersede_arm_commands(armed)
         now = self._now()
-        recent_modes = {mode for ordered_at, mode in self._ordered_modes if ordered_at > now - OWN_MODES_MAX_AGE_S}
+        since = now - OWN_MODES_MAX_AGE_S
+        recent_modes = {custom_mode for ordered_at, custom_mode in self._ordered_modes if ordered_at > since}
         self._ordered_modes.extend((now, mode.custom_mode) for mode in modes)
         order = self._new_order(
             modes=modes,
@@ -506,6 +507,7 @@ class CommandArbiter:
             receiver.on_armed(armed, self._telemetry.armed.updated_at)
 
     def _on_arming(self) -> None:
+        """If the program has armed the vehicle, create the order that records takeovers and failsafes from now on."""
         self.last_arming_at = self._telemetry.armed.updated_at
         is_order_in_progress = self.is_arm_command_open or any(order.armed for order in self._posted_orders)
         accepted_at = self._arming_accepted_at

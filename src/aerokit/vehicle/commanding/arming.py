@@ -190,7 +190,7 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
-            # Another task may have ordered something else since, above all to disarm.
+            # Another task may have ordered something else since, above all to disarm. One arm command is our own.
             is_newest_order = (
                 self._arbiter.latest(STEERING) is order_before
                 and self._arbiter.arm_commands_sent == arm_commands_before + 1

@@ -187,6 +187,7 @@ class FlightCleanup:
         if can_send_now:
             command, *params = self._hold_command(mode)
             self._session.commands.send_unconfirmed(int(command), *params)
+            # The new order replaces the abandoned one, whose modes the vehicle may still report.
             order = self._arbiter.order(*order.modes, mode)
             self._arbiter.doubt_mode()
         self._task.start(partial(self._complete_hold, mode, order, is_sent=can_send_now))

@@ -123,14 +123,12 @@ class PathSetpoints:
             self.is_on_path = True
             self._flown_m = length_m
             self._present_speed_m_s = 0.0
-        fraction = self._flown_m / length_m if length_m else 1.0
-        north, east, down = (
-            coordinate + fraction * component
-            for coordinate, component in zip(self._initial_offset, to_path, strict=True)
-        )
-        speed = self._present_speed_m_s
-        north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)
-        return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), acceleration=(0.0, 0.0))
+        # The unit vector towards the path; zero if the set-point begins there.
+        to_north, to_east, to_down = (component / length_m if length_m else 0.0 for component in to_path)
+        flown_m, speed = self._flown_m, self._present_speed_m_s
+        place = (start_north + flown_m * to_north, start_east + flown_m * to_east)
+        velocity = (speed * to_north, speed * to_east, speed * to_down)
+        return self._setpoint(place, start_down + flown_m * to_down, velocity, acceleration=(0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:
         metres_per_radian = math.hypot(*self._path.at(self._phase).tangent)

@@ -117,12 +117,8 @@ class ImpactDetector:
         self._sank_fast_at = self._updated_at
 
     def _on_sudden_stop(self) -> None:
-        altitude_m = self.current_altitude()
-        drop_m = (
-            None
-            if self._altitude_before_descent_m is None or altitude_m is None
-            else self._altitude_before_descent_m - altitude_m
-        )
+        top_m, altitude_m = self._altitude_before_descent_m, self.current_altitude()
+        drop_m = None if top_m is None or altitude_m is None else top_m - altitude_m
         # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
         if drop_m is None or drop_m >= MIN_DROP_M:
             self._impact_sink_m_s = self._max_sink_m_s

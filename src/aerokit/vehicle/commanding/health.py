@@ -146,14 +146,12 @@ class Health:
         return [self.unarmable_text(mode)] if mode is not None and mode.name in self._unarmable_modes() else []
 
     def unarmable_text(self, mode: Mode) -> str:
-        option = self._autopilot.armable_by_option.get(mode.name)
+        firmware, option = self._autopilot.firmware, self._autopilot.armable_by_option.get(mode.name)
         armable_modes = ", ".join(sorted({*self._autopilot.modes.names} - self._unarmable_modes()))
-        text, when = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {armable_modes}", "first"
-        if option is not None:
-            text, when = (
-                f"{self._autopilot.firmware} cannot arm in {mode.name} unless {option} allows it",
-                "after a refusal",
-            )
+        if option is None:
+            text, when = f"{firmware} cannot arm in {mode.name}, only in {armable_modes}", "first"
+        else:
+            text, when = f"{firmware} cannot arm in {mode.name} unless {option} allows it", "after a refusal"
         arming_mode = self._autopilot.mode_to_arm_in()
         return text if arming_mode is None else f"{text}; arm() changes to {arming_mode.name} {when}"
 

@@ -132,6 +132,7 @@ class ChangeSignal:
             detach()
 
     async def next(self, at_most_s: float) -> None:
+        """Wait for the next change, at most ``at_most_s`` seconds."""
         self._changed.clear()
         # No cancel scope is used, because on Python 3.10 an expiring scope swallows a cancellation in the same
         # iteration of the event loop.
@@ -228,17 +229,17 @@ class VehiclePosition:
     def __init__(self, session: VehicleSession) -> None:
         self._telemetry, self._autopilot = session.telemetry, session.autopilot
         # Radius of the circle that the vehicle was ordered to fly; 0 if it was not ordered to circle.
-        self._circle_m = 0.0
+        self._circle_radius_m = 0.0
         session.telemetry.mode.observe(lambda *_: self.record_circle_radius(0.0))
 
     def record_circle_radius(self, radius_m: float) -> None:
         # ArduPlane keeps this radius for further places until it leaves GUIDED.
-        self._circle_m = radius_m
+        self._circle_radius_m = radius_m
 
     @property
     def arrival_radius_m(self) -> float:
         """Distance from the target at which the vehicle counts as arrived."""
-        return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
+        return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_radius_m)
 
     def distance_to(self, target: Position) -> float:
         """Return the distance to ``target`` in metres; infinite while the position is unknown.

@@ -263,7 +263,7 @@ class RoundFlight:
     async def _stream_to_end(self, setpoints: PathSetpoints, order: Order) -> None:
         """Stream the set-points until the vehicle has flown all rounds. ``order`` is the stream's steering order."""
         stream = Guided(self._context).trajectory(
-            setpoints.advance(0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
+            setpoints.advance(seconds=0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
         )
         stream._prepared_order = order
         async with stream:
@@ -278,4 +278,4 @@ class RoundFlight:
                     raise OperationTimeout(
                         f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
                     )
-                await stream.fly(setpoints.advance(0.0), SETPOINT_INTERVAL_S)  # the last set-point again
+                await stream.fly(setpoints.advance(seconds=0.0), SETPOINT_INTERVAL_S)  # the last set-point again

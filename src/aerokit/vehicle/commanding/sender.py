@@ -414,7 +414,7 @@ class OrderSender:
 
         def failure_reason() -> str:
             detector.update()
-            order.impact = detector.describe() if order.is_newest else ""
+            order.impact = detector.describe() if order.is_newest else ""  # `FlightCleanup.flying` reads it.
             return order.impact
 
         return failure_reason

@@ -51,6 +51,9 @@ POSITION_ONLY = 0x0DF8
 KEEP_THROTTLE = -1
 """param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
 
+# param1 of DO_SET_HOME.
+USE_PRESENT_POSITION, USE_PLACE = 1, 0
+
 HOME_TOLERANCE_M = 5.0
 """Home counts as moved to a place within this distance; a COMMAND_LONG has a resolution of about two metres."""
 
@@ -124,6 +127,7 @@ class TravelActions(VehicleBase):
         self._check_can_turn(heading_deg)
         self._position.check_flying("go_to")
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
+        # The second mode is for firmware that does not support MAV_CMD_DO_REPOSITION; see `_send_target`.
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
         is_incomplete = False  # True once the vehicle has accepted the target, until the speed and the heading are set.
@@ -355,8 +359,8 @@ class TravelActions(VehicleBase):
         While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
-        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
-        metre.
+        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about two
+        metres.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
@@ -404,14 +408,14 @@ class TravelActions(VehicleBase):
     async def _send_home(self, home_order: Order, place: Position | Home | None) -> None:
         with self._arbiter.auxiliary_order(home_order) as order:
             if place is None:
-                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1 means the present position.
+                await self._sender.send_long(order, MavCmd.DO_SET_HOME, USE_PRESENT_POSITION)
                 return
             # The command takes altitudes above mean sea level only.
             amsl_place = position_with_altitude(place).replace(altitude_relative_m=None)
             latitude, longitude, altitude, _ = self._position.global_target(amsl_place)
             position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
             send = self._session.commands.send_place
-            await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
+            await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, USE_PLACE, **position)
 
     async def _request_home(self) -> None:
         with suppress(AerokitError):

@@ -199,6 +199,7 @@ class MeasurementStream(Generic[MeasurementT]):
             self._timer = asyncio.get_running_loop().call_at(self._period_ends_at, self._send_waiting)
 
     def _send_waiting(self) -> None:
+        """Send the waiting measurement, unless it is too old or the vehicle is silent, and begin the next period."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

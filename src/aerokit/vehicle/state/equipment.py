@@ -180,12 +180,12 @@ def range_finder(message: messages.Rangefinder, context: Context) -> tuple[Range
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
     """Return all receivers reported so far, the first one with the new values of this message."""
-    return _updated_entries(context.before, _gps_receiver(message, 0), key=_index_of)
+    return _updated_entries(context.before, _gps_receiver(message, index=0), key=_index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
     """Return all receivers reported so far, the second one with the new values of this message."""
-    return _updated_entries(context.before, _gps_receiver(message, 1), key=_index_of)
+    return _updated_entries(context.before, _gps_receiver(message, index=1), key=_index_of)
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
