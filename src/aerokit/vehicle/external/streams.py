@@ -185,10 +185,8 @@ class MeasurementStream(Generic[MeasurementT]):
         messages = self._encode(measurement)
         for message in messages:
             message.encode()  # An invalid value raises here, and not when the timer sends the message.
-        connection = self._session.connection
-        if not connection.is_open:
-            connection.send(messages[0])  # This raises the error that has ended the connection.
-        now = connection.now()
+        self._session.connection.raise_if_ended()
+        now = self._session.connection.now()
         measured_at: float | None = getattr(measurement, "measured_at", None)
         if self._waiting is not None:  # The new measurement replaces the waiting one.
             self._dropped += 1
