@@ -331,9 +331,8 @@ class ArmCleanup:
         if not self._is_newest_arm_command(order):
             return False
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
-        self._task.start(
-            partial(self._watch_arming, order, was_armed, mode_when_abandoned=self._session.telemetry.mode.latest)
-        )
+        mode = self._session.telemetry.mode.latest
+        self._task.start(partial(self._watch_arming, order, was_armed, mode_when_abandoned=mode))
         return True
 
     def _is_newest_arm_command(self, order: Order) -> bool:

@@ -92,11 +92,8 @@ class FlightActions(VehicleBase):
                 f"take_off: the vehicle is already {IN_THE_AIR[landed.latest]}: use go_to() to climb; nothing was sent"
             )
         # The modes that the vehicle may report during the take-off.
-        modes = (
-            plan.mode,
-            plan.mode_after,
-            self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol),
-        )
+        take_off_mode = self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol)
+        modes = (plan.mode, plan.mode_after, take_off_mode)
         order = self._arbiter.order(*(mode for mode in modes if mode is not None))
         try:
             with self._flight_cleanup.flying(order):

@@ -225,9 +225,7 @@ class ManeuverActions(VehicleBase):
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
         else:
             counter = TurnCounter(radius_m, clockwise=clockwise)
-            command, params, mode = self._circle_command(
-                "loiter", radius_m, speed_m_s=math.nan, facing="free", clockwise=clockwise
-            )
+            command, params, mode = self._circle_command("loiter", radius_m, clockwise=clockwise)
         limits = FlightLimits(max_distance_m, timeout, max_silence_s)
         rounds = turns or 0.0  # With 0, the flight ends after the arrival and the stay.
         flight = RoundFlight(self._context, "loiter", center, counter, rounds, limits, center_name="target")
@@ -281,7 +279,7 @@ class ManeuverActions(VehicleBase):
         return FollowStream(self._context, target, place, valid_for_s, max_distance_m)
 
     def _circle_command(
-        self, operation: str, radius_m: float, speed_m_s: float, facing: Facing, *, clockwise: bool
+        self, operation: str, radius_m: float, speed_m_s: float = math.nan, facing: Facing = "free", *, clockwise: bool
     ) -> tuple[int, tuple[float, ...], Mode]:
         """Return the command that circles a place, its first four parameters, and the mode that it leads to."""
         if self.autopilot.circles_by == "orbit":

@@ -74,7 +74,7 @@ class RoundFlight:
         self._circle_problem = ""
         position = context.vehicle_position
         # The frame, x, y and z of a COMMAND_INT to the center.
-        self._command_int_center = position.command_int_place(center, center_name)
+        self._place_fields = position.command_int_place(center, center_name)
         self._center = position.with_sent_altitude(center)
         position.check_reach(center_name, [center], limits.max_distance_m)
         position.check_flying(operation)
@@ -109,9 +109,7 @@ class RoundFlight:
             with cleanup.flying(order):
                 with context.arbiter.changing_mode():
                     send = self._session.commands.send_int
-                    await context.sender.run_command(
-                        order, send, command, *params, modes=(mode,), **self._command_int_center
-                    )
+                    await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place_fields)
                 self._center = context.vehicle_position.with_amsl_altitude(self._center)
                 with self._session.streaming("position"):
                     await self._await_rounds(order, mode, stay_s, radius_m)

@@ -254,12 +254,7 @@ class OrderSender:
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
             await self.await_mode(
-                mode,
-                order,
-                refusals,
-                timeout=remaining_s,
-                reported_since=reported_since,
-                is_over=lambda: is_over(acknowledged_at),
+                mode, order, refusals, remaining_s, reported_since, is_over=lambda: is_over(acknowledged_at)
             )
             self._arbiter.settle_mode()
 

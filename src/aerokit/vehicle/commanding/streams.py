@@ -174,8 +174,8 @@ class ValueStream(Generic[ValueT]):
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        """End the stream. The next call, or the end of the block, raises ``_stop_error``, which this method sets."""
-        self._stop_sending()
+        """Stop sending. The next call, or the end of the block, raises ``_stop_error``, which this method sets."""
+        self._end()
         is_state_recent = self._context.arbiter.is_state_recent
         hold_text = "a hold was ordered" if is_state_recent else "a hold will be ordered after the next HEARTBEAT"
         is_hold_ordered = hold and self._hold()
@@ -191,7 +191,8 @@ class ValueStream(Generic[ValueT]):
     def _release(self) -> None:
         """End the effect of the last value, if the vehicle would otherwise keep executing it."""
 
-    def _stop_sending(self) -> None:
+    def _end(self) -> None:
+        """Stop sending."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -251,7 +252,7 @@ class SteeringStream(ValueStream[ValueT]):
             await self._check_support()
             takeover_check.raise_if_changed(self._NAME)
         except BaseException:
-            self._stop_sending()
+            self._end()  # Another stream may be entered from now on.
             raise
         order = self._prepared_order or self._context.arbiter.order(mode)
         self._order = order
@@ -260,7 +261,7 @@ class SteeringStream(ValueStream[ValueT]):
         try:
             await self._enter(mode, order)
         except BaseException as error:
-            self._stop_sending()
+            self._end()  # Nothing is sent from now on.
             # After a refusal, the vehicle continues its previous task. After all other errors, it is ordered to hold,
             # unless the order has ended, for example because a pilot took over.
             if not isinstance(error, CommandRejected):
@@ -282,7 +283,7 @@ class SteeringStream(ValueStream[ValueT]):
             raise self._stop_error
 
     async def _leave(self, exc: BaseException | None) -> None:
-        self._stop_sending()
+        self._end()  # Nothing is sent from now on, except the hold.
         self._stop_error = SetpointStreamStopped(f"the async with block of this {self._NAME} was left")
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
@@ -342,8 +343,8 @@ class SteeringStream(ValueStream[ValueT]):
     def _hold(self) -> bool:
         return self._order is not None and self._context.flight_cleanup.hold_in_background(self._order)
 
-    def _stop_sending(self) -> None:
-        super()._stop_sending()
+    def _end(self) -> None:
+        super()._end()
         if self._context.flight_cleanup.stop_stream == self._stop:
             self._context.flight_cleanup.stop_stream = None
 

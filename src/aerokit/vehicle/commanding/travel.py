@@ -51,8 +51,7 @@ POSITION_ONLY = 0x0DF8
 KEEP_THROTTLE = -1
 """param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
 
-# param1 of DO_SET_HOME.
-USE_PRESENT_POSITION, USE_PLACE = 1, 0
+USE_PRESENT_POSITION, USE_PLACE = 1, 0  # param1 of DO_SET_HOME
 
 HOME_TOLERANCE_M = 5.0
 """Home counts as moved to a place within this distance; a COMMAND_LONG has a resolution of about two metres."""

@@ -109,7 +109,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._began_at = self._now()
             self._begin_sending()
         except (CommandRejected, NotSupported):  # The gimbal does not turn, because the manager refused.
-            self._stop_sending()
+            self._end()
             raise
         except BaseException:  # The gimbal may turn, because the manager may have received the command.
             self._stop("it was not entered")
@@ -122,9 +122,9 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if reason:
             self._stop(reason, hold=False)
         if self._stop_error is None:
-            # Create the command before `_stop_sending`: afterwards it might address another gimbal.
+            # Create the command before `_end`: afterwards it might address another gimbal.
             zero = self._zero_rates_command()
-            self._stop_sending()
+            self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
                 await zero.send_and_wait(f"{self._orders.name}: rates of zero")
@@ -186,8 +186,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     def _finish(self) -> None:
         self._stop("the block of the vehicle has ended")
 
-    def _stop_sending(self) -> None:
-        super()._stop_sending()
+    def _end(self) -> None:
+        super()._end()
         self._cleanup.close()
 
 

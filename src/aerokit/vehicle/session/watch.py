@@ -103,7 +103,7 @@ class VehicleWatch:
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
         # The vehicle's time in the last answer to a TIMESYNC request.
-        self._last_answer = _ClockReading(milliseconds=0, read_at=-math.inf)
+        self._last_answer = _ClockReading(0, read_at=-math.inf)
         attach = connection.bus.attach
         self._detach_callbacks: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
         attach_frames = connection.bus.attach_frames
@@ -257,7 +257,7 @@ class VehicleWatch:
         self._last_readings = {clock: _ClockReading(milliseconds, now)}
         self._decreased_readings = {}
         self._first_reading = None
-        self._last_answer = _ClockReading(milliseconds=0, read_at=now)
+        self._last_answer = _ClockReading(0, now)
         self._reboot_ordered_at = None
         self.reboots += 1
         self._on_reboot()
