@@ -86,11 +86,8 @@ class BackgroundTask:
             with anyio.CancelScope(shield=True), anyio.move_on_after(max_wait_s):
                 await self._done.wait()
         if self.is_open:
-            logger.warning(
-                "the async with block of this vehicle was left %s: %s",
-                self._warning_clause,
-                self._session.describe_link(),
-            )
+            link = self._session.describe_link()
+            logger.warning("the async with block of this vehicle was left %s: %s", self._warning_clause, link)
 
 
 # Seconds to wait for the acknowledgement of a hold at the end of the vehicle's `async with` block.
