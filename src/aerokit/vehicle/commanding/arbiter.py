@@ -164,7 +164,8 @@ class CommandArbiter:
         was_flown = self.is_flown_by_program
         if self.newest is not None:
             self._expect_late_effects(self.newest)
-        order = self._new_tolerant_order(modes, (STEERING,), ends_flight=ends_flight or self._all_end_flight(modes))
+        ends_flight = ends_flight or self._all_end_flight(modes)
+        order = self._new_order_expecting_late_modes(modes, (STEERING,), ends_flight=ends_flight)
         order.was_flown_before = was_flown
         # If this order replaces an order in progress, the vehicle may already be moving.
         order.may_move = self._is_executing_newest()
@@ -223,7 +224,7 @@ class CommandArbiter:
         modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ending_topics
         action_topics = (ACTION,) if ends_with_actions else ()
-        order = self._new_tolerant_order(modes, (*action_topics, *device_topics), ends_flight=ends_flight)
+        order = self._new_order_expecting_late_modes(modes, (*action_topics, *device_topics), ends_flight=ends_flight)
         self._orders_in_progress.append(order)
         try:
             yield order
@@ -424,7 +425,7 @@ class CommandArbiter:
 
     # ------------------------------------------------------------------------------- internals
 
-    def _new_tolerant_order(
+    def _new_order_expecting_late_modes(
         self, modes: Collection[Mode], ending_topics: Sequence[Topic], *, ends_flight: bool = False
     ) -> Order:
         """Create an order that stays valid if an earlier order changes the mode late."""
@@ -518,7 +519,8 @@ class CommandArbiter:
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
         # Without topics, no newer order ends this order.
-        self._arming_order = self._new_tolerant_order(modes, ending_topics=()) if was_armed_by_program else None
+        order = self._new_order_expecting_late_modes(modes, ending_topics=())
+        self._arming_order = order if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:
         arm_order = () if self._arming_order is None else (self._arming_order,)
