@@ -57,14 +57,14 @@ def _all(stage: Stage) -> Iterator[str]:
         "answer under way", [key for key in vehicle._session.commands._pending_acks if _is_awaited(vehicle, key)]
     )
     yield from _times("command that waits", vehicle._session.commands._runs)
-    yield from _times("order", vehicle._arbiter._orders[1:])
-    yield from _times("sending", vehicle._arbiter._sent)
+    yield from _times("order", vehicle._arbiter._orders_in_progress[1:])
+    yield from _times("sending", vehicle._arbiter._sent_commands)
     yield from _times("held parameter", vehicle.parameters._registry._blocks)
     closing = vehicle.files._channel._closing.values()
     yield from _times("file that is being closed", [task for _, task in closing if not task.done()])
     yield from _times("open session", range(stage.simulated.ftp.open_sessions))
     yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
-    yield from _times("set-point stream", range(vehicle._flight_cleanup.stop_stream is not None))
+    yield from _times("set-point stream", range(vehicle._flight_cleanup.is_stream_open))
     yield from (f"lock {name}" for name, lock in _locks("vehicle", vehicle, set()) if lock.locked())
 
 

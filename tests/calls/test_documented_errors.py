@@ -125,7 +125,7 @@ async def settle(stage: Stage) -> None:
     """Wait until the vehicle is received again, pending confirmations have arrived, and it stands."""
     await anyio.sleep(4.0)
     await stage.vehicle.home.wait_until(lambda _: True, timeout=30)
-    stage.vehicle._arm_cleanup.stop()
+    stage.vehicle._arm_cleanup.stop_watching()
 
 
 def is_it(raised: Exception, name: str, error: str) -> bool:

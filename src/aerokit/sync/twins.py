@@ -4839,8 +4839,8 @@ class Vehicle(VehicleTwin):
         While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
-        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
-        metre.
+        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about two
+        metres.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.

@@ -118,31 +118,16 @@ async def connect(
     used_dialect = address.bus.dialect if isinstance(address, Connection) else dialect
     _check_arguments(system_id, timeout, rates, used_dialect)
     if isinstance(address, Connection):
-        if record is not None:
-            raise InvalidArgument(
-                "record = … is not allowed here: the connection is already open; use connection.record(…)"
-            )
-        if signing is not None:
-            raise InvalidArgument(
-                "signing = … is not allowed here: the connection is already open; set connection.signing"
-            )
-        if reconnect:
-            raise InvalidArgument(
-                "reconnect = True is not allowed here: the connection is already open;"
-                " pass reconnect to open_connection"
-            )
-        if heartbeat != OwnHeartbeat():
-            raise InvalidArgument(
-                "heartbeat = … is not allowed here: the connection is already open; pass heartbeat to open_connection"
-            )
-        if peers is not None or may_move:
-            raise InvalidArgument(
-                "peers and may_move are not allowed here: the connection is already open; pass them to open_connection"
-            )
-        if share:
-            raise InvalidArgument(
-                "share = … is not allowed here: the connection is already open; use aerokit.hub.shared(connection, …)"
-            )
+        for is_given, arguments, instead in (
+            (record is not None, "record = … is", "use connection.record(…)"),
+            (signing is not None, "signing = … is", "set connection.signing"),
+            (reconnect, "reconnect = True is", "pass reconnect to open_connection"),
+            (heartbeat != OwnHeartbeat(), "heartbeat = … is", "pass heartbeat to open_connection"),
+            (peers is not None or may_move, "peers and may_move are", "pass them to open_connection"),
+            (bool(share), "share = … is", "use aerokit.hub.shared(connection, …)"),
+        ):
+            if is_given:
+                raise InvalidArgument(f"{arguments} not allowed here: the connection is already open; {instead}")
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
         return
@@ -282,16 +267,16 @@ class _Search:
         self._found: _Found | None = None
         self._error: Exception | None = None
         self._ended = asyncio.Event()
-        # Number of heartbeats of each autopilot other than component 1.
-        self._lone_heartbeats: dict[tuple[int, int], int] = {}
+        # Number of heartbeats of each autopilot other than component 1, by system id and component id.
+        self._heartbeat_counts: dict[tuple[int, int], int] = {}
         self.description = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
             return
-        has_usual_id = frame.component_id == MavComponent.AUTOPILOT1
-        if not has_usual_id and not self._has_sent_enough(frame):  # Component 1 takes precedence.
+        # Component 1 takes precedence, so an autopilot with another id must first send several heartbeats.
+        if frame.component_id != MavComponent.AUTOPILOT1 and not self._has_sent_enough(frame):
             return
         try:
             if frame.system_id in self._connection.attached:
@@ -306,7 +291,7 @@ class _Search:
     def _has_sent_enough(self, frame: Frame) -> bool:
         """Count a heartbeat. Return True after ``MIN_LONE_HEARTBEATS`` of the same sender."""
         source = (frame.system_id, frame.component_id)
-        counts = self._lone_heartbeats
+        counts = self._heartbeat_counts
         if source not in counts and len(counts) >= MAX_ROUTES:  # A faulty sender may use many ids.
             return False
         counts[source] = counts.get(source, 0) + 1
@@ -327,8 +312,7 @@ class _Search:
 
     def close(self) -> None:
         self._ended.set()
-        # `result` has not returned this vehicle to the caller.
-        if self._found is not None:
+        if self._found is not None:  # `result` has not returned this vehicle to the caller.
             context, vehicle, _ = self._found
             context.session.close()
             self._connection.attached.discard(vehicle.system_id)

@@ -78,13 +78,13 @@ class Vehicle(
     def __init__(self, context: VehicleContext) -> None:
         super().__init__(context)
         self._plans = PlanContext(context, lambda: self.files)
+        # Reading a sub-object creates it. Some must also be created when the vehicle sends their first message.
         create_on_first = partial(self.connection.bus.create_on_first, system_id=self.system_id)
-        unsubscribe_functions = (
+        context.session.at_close(
             create_on_first(GIMBAL_MESSAGE_IDS, lambda: self.gimbal),
             create_on_first([ParamValue.ID], lambda: self.parameters),
             create_on_first(PICTURE_MESSAGE_IDS, lambda: self._cameras),
         )
-        context.session.at_close(*unsubscribe_functions)
 
     # A sub-object is imported and created on first use, or when the vehicle first sends a message that the sub-object
     # handles.
@@ -179,8 +179,8 @@ class Vehicle(
         """
         from aerokit.vehicle.commanding.sticks import StickStream
 
-        limits = (rate_hz, valid_for_s, max_lag_s)
-        return StickStream(self._context, self.parameters.probe, mode, initial, *limits)
+        probe = self.parameters.probe
+        return StickStream(self._context, probe, mode, initial, rate_hz, valid_for_s, max_lag_s)
 
     @cached_property
     def external(self) -> External:

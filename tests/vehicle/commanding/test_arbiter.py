@@ -205,7 +205,7 @@ def test_late_modes_of_several_replaced_orders_are_no_takeover() -> None:
 @pytest.mark.parametrize(("after_s", "end"), [(MODE_GRACE_S - 0.1, ""), (MODE_GRACE_S, "the mode changed to GUIDED")])
 def test_accepted_posted_mode_after_its_block_is_no_takeover(after_s: float, end: str) -> None:
     stage = Stage()
-    with stage.arbiter.post(("mode", "motion"), modes=(GUIDED,)) as posted, stage.arbiter.sending(posted):
+    with stage.arbiter.posted_order(("mode", "motion"), modes=(GUIDED,)) as posted, stage.arbiter.sending(posted):
         pass
     stage.now += after_s
     order = stage.arbiter.order(BRAKE)
@@ -540,7 +540,7 @@ def test_posted_mode_after_order_is_no_takeover() -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     stage.report(GUIDED)
-    with stage.arbiter.post(["mode"], modes=[RTL]):
+    with stage.arbiter.posted_order(["mode"], modes=[RTL]):
         stage.report(RTL)
     assert not order.has_lost_mode
     stage.report(LOITER)

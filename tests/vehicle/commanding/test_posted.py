@@ -68,7 +68,7 @@ class Stage:
 
     def post(self, *subjects: Subject, mode: Mode | None = None, armed: bool | None = None) -> Order:
         modes = () if mode is None else (mode,)
-        return self._open.enter_context(self.arbiter.post(subjects, modes=modes, armed=armed))
+        return self._open.enter_context(self.arbiter.posted_order(subjects, modes=modes, armed=armed))
 
 
 def end_of(order: Order) -> str:

@@ -13,6 +13,7 @@ from flight_harness import Flight, Px4Flight, block_loop, open_flight, open_px4,
 from aerokit import Position
 from aerokit import messages as m
 from aerokit.errors import (
+    ConnectionClosed,
     InvalidArgument,
     NotSupported,
     OperationRejected,
@@ -373,6 +374,13 @@ async def test_unreported_parameters_raise_timeout() -> None:
         with pytest.raises(ParameterTimeout):
             async with flight.vehicle.external.odometry():
                 raise AssertionError("entered")
+
+
+async def test_no_points_after_end_raise_connection_closed() -> None:
+    async with open_flight(copter()) as flight, flight.vehicle.external.obstacle_points() as stream:
+        flight.vehicle.connection.close()
+        with pytest.raises(ConnectionClosed):
+            stream.send(v.ObstaclePoints((), 0.2, 10.0))
 
 
 async def test_px4_target_without_position_raises() -> None:

@@ -50,12 +50,14 @@ class CommandArbiter:
     or the DroneKit API.
     """
 
-    def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
+    def __init__(
+        self, now: Callable[[], float], telemetry: Telemetry, slept_since: Callable[[float], float] = lambda _: 0.0
+    ) -> None:
         self._now, self._telemetry = now, telemetry
         # Returns how many seconds the computer has slept since the given time.
-        self.slept_since: Callable[[float], float] = lambda _: 0.0
+        self.slept_since = slept_since
         self.newest: Order | None = None
-        """The last steering order given by an action or a raw command."""
+        """The last steering order (an order about where to fly, or in which mode) of an action or a raw command."""
         self.arm_commands_sent: int = 0
         """Number of arm and disarm commands sent."""
         self.disarm_commands_sent: int = 0
@@ -74,9 +76,9 @@ class CommandArbiter:
         # another party has armed it.
         self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
-        self._orders: list[Order] = []
-        self._posted: list[Order] = []  # orders whose `post` block is active
-        self._sent: list[SentCommand] = []  # commands whose `sending` block is active
+        self._orders_in_progress: list[Order] = []
+        self._posted_orders: list[Order] = []  # orders whose `posted_order` block is active
+        self._sent_commands: list[SentCommand] = []  # commands whose `sending` block is active
         # Modes that HEARTBEAT may still report although the order for them has ended, and the mode after a mission.
         # Each has the time at which it was added.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
@@ -113,23 +115,23 @@ class CommandArbiter:
         latest_orders = (self.latest(topic) for topic in order.ending_topics if topic != ACTION)
         return any(latest is not None and latest.number > order.number for latest in latest_orders)
 
-    def _register(self, order: Order, topics: Iterable[Topic]) -> None:
+    def _set_latest(self, order: Order, topics: Iterable[Topic]) -> None:
         self._latest.update(dict.fromkeys(topics, order))
 
     def supersede(self, topics: Iterable[Topic]) -> None:
         topics = tuple(topics)
         self._ordered_since_disarmed.update(topics)
         # An order without commands, which ends the posted orders about these topics, because it is newer.
-        self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
+        self._set_latest(self._new_order(), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
         """Create an order about a device. It supersedes the previous order about this device.
 
         With ``may_be_withdrawn``, withdrawing the new order makes the previous one valid again.
         """
-        order = Order(self._now(), next(self._order_numbers), self._is_newest, ending_topics=(topic,))
+        order = self._new_order(ending_topics=(topic,))
         order.previous = self.latest(topic) if may_be_withdrawn else None
-        self._register(order, (topic,))
+        self._set_latest(order, (topic,))
         return order
 
     @contextmanager
@@ -152,27 +154,29 @@ class CommandArbiter:
     ) -> Order:
         """Create a steering order, which may change the mode to ``modes``. It supersedes the previous one.
 
-        Posted orders about ``subjects`` end, too. With ``ends_flight``, a failsafe does not end the new order.
+        Orders of :meth:`posted_order` about ``subjects`` end, too. With ``ends_flight``, a failsafe does not end the
+        new order.
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
-        if self._posted_modes():  # A `post` block may change the mode later than this order does.
+        if self._unconfirmed_posted_modes():  # A posted order may change the mode later than this order does.
             self.doubt_mode()
         was_flown = self.is_flown_by_program
         if self.newest is not None:
-            self._record_unreported(self.newest)
-        order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
+            self._expect_late_effects(self.newest)
+        ends_flight = ends_flight or self._all_end_flight(modes)
+        order = self._new_order_expecting_late_modes(modes, (STEERING,), ends_flight=ends_flight)
         order.was_flown_before = was_flown
         # If this order replaces an order in progress, the vehicle may already be moving.
-        order.may_move = self._is_steering()
-        self._register(order, (*subjects, STEERING, ACTION))
+        order.may_move = self._is_executing_newest()
+        self._set_latest(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
         # Remove orders that have ended, so that HEARTBEATs no longer update them.
-        self._orders = [active for active in self._orders if active.is_newest]
-        for active in self._orders:  # A change to a mode of the new order is not a takeover.
-            active.expect(modes, any_until=order.any_mode_until)
-        self._orders.append(order)
+        self._orders_in_progress = [active for active in self._orders_in_progress if active.is_newest]
+        for active in self._orders_in_progress:  # A change to a mode of the new order is not a takeover.
+            active.accept_as_effects(modes, any_until=order.any_mode_until)
+        self._orders_in_progress.append(order)
         return order
 
     def raw_order(self, subjects: Collection[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
@@ -193,7 +197,7 @@ class CommandArbiter:
             callback()
 
     def on_reboot(self) -> None:
-        for order in (*self._orders, *self._posted):
+        for order in (*self._orders_in_progress, *self._posted_orders):
             order.on_reboot()
         self._ordered_since_disarmed.clear()
         self._arming_order = None
@@ -220,22 +224,22 @@ class CommandArbiter:
         modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ending_topics
         action_topics = (ACTION,) if ends_with_actions else ()
-        order = self._create_order(modes, (*action_topics, *device_topics), ends_flight)
-        self._orders.append(order)
+        order = self._new_order_expecting_late_modes(modes, (*action_topics, *device_topics), ends_flight=ends_flight)
+        self._orders_in_progress.append(order)
         try:
             yield order
         finally:
-            self._orders = [active for active in self._orders if active is not order]
+            self._orders_in_progress = [active for active in self._orders_in_progress if active is not order]
 
     @contextmanager
-    def post(
+    def posted_order(
         self, subjects: Sequence[Subject], *, modes: Collection[Mode] = (), armed: bool | None = None
     ) -> Iterator[Order]:
-        """Create a posted order, which is valid during the `with` block.
+        """Create an order that the program does not wait for (`Vehicle.posted`), valid during the `with` block.
 
         The order is about the first of ``subjects``; a later order about the same subject ends it. The order itself
         ends earlier posted orders about any of ``subjects``. An order about "mode" or "motion" also ends the action in
-        progress.
+        progress. The order may change the mode to ``modes``, and arms or disarms the vehicle if ``armed`` is not None.
         """
         first_subject = subjects[0]
         is_steering = first_subject != "arm"
@@ -243,17 +247,19 @@ class CommandArbiter:
         if is_steering:
             self._notify_steering()
             arming_order = () if self._arming_order is None else (self._arming_order,)
-            for previous in (*arming_order, *self._orders):
+            for previous in (*arming_order, *self._orders_in_progress):
                 if ACTION not in previous.ending_topics:  # A change to a mode of the new order is not a takeover.
-                    previous.expect(modes)
-        self._supersede_arming(armed)
+                    previous.accept_as_effects(modes)
+        if armed is not None:
+            self._supersede_arm_commands(armed)
         now = self._now()
-        recent_modes = {mode for ordered_at, mode in self._ordered_modes if ordered_at > now - OWN_MODES_MAX_AGE_S}
+        since = now - OWN_MODES_MAX_AGE_S
+        recent_modes = {custom_mode for ordered_at, custom_mode in self._ordered_modes if ordered_at > since}
         self._ordered_modes.extend((now, mode.custom_mode) for mode in modes)
-        order = self._build_order(
-            modes,
-            (first_subject,),
-            recent_modes,
+        order = self._new_order(
+            modes=modes,
+            ending_topics=(first_subject,),
+            expected=recent_modes,
             armed=armed,
             # An order to disarm stays valid after a mode change and during a failsafe.
             ends_flight=self._all_end_flight(modes) or disarms,
@@ -261,14 +267,14 @@ class CommandArbiter:
             ends_on_disarm=first_subject == "motion",
             requires_mode_change=True,
         )
-        self._register(order, (*subjects, STEERING) if is_steering else subjects)
+        self._set_latest(order, (*subjects, STEERING) if is_steering else subjects)
         self._ordered_since_disarmed.update(subjects)
-        self._posted.append(order)
+        self._posted_orders.append(order)
         try:
             yield order
         finally:
-            self._posted.remove(order)
-            self._record_unreported(order)
+            self._posted_orders.remove(order)
+            self._expect_late_effects(order)
             order.close()
 
     @contextmanager
@@ -290,53 +296,53 @@ class CommandArbiter:
             is_done=is_done,
             slept_s=partial(self.slept_since, self._now()),
         )
-        if order.armed is None and armed is not None:  # `post` has counted orders with `armed`.
-            self._supersede_arming(armed)
-            order.arm_command = self.arm_commands_sent
-        self._sent.append(sent)
+        if order.armed is None and armed is not None:  # With `order.armed`, `posted_order` has done this already.
+            self._supersede_arm_commands(armed)
+            order.arm_command_number = self.arm_commands_sent
+        self._sent_commands.append(sent)
         sent_at = self._now()
         try:
             yield sent
             # The block has not raised, so the vehicle has accepted the command.
             order.was_refused = False  # The order's previous command may have been refused as unsupported.
-            self._record_accepted(armed)
+            self._record_acceptance(armed, self._now())
         except CommandRejected:
             order.was_refused = True
             raise
-        except BaseException as error:  # The command was abandoned, but its acknowledgement and effect may follow.
+        except BaseException as error:
+            # The caller has abandoned the command, but the vehicle may have accepted it at once. Only a CommandTimeout
+            # says if the command was not even sent.
             if getattr(error, "was_sent", True):
-                self._record_accepted(armed, sent_at)
+                self._record_acceptance(armed, sent_at)
             raise
         finally:
-            self._sent.remove(sent)
+            self._sent_commands.remove(sent)
 
     def record_own_arming(self, armed: bool) -> None:
         """Record that an arm or disarm command was sent without waiting for the acknowledgement."""
-        self._supersede_arming(armed)
-        self._record_accepted(armed)
+        self._supersede_arm_commands(armed)
+        self._record_acceptance(armed, self._now())
 
-    def _record_accepted(self, armed: bool | None, accepted_at: float | None = None) -> None:
+    def _record_acceptance(self, armed: bool | None, accepted_at: float) -> None:
         if armed:  # HEARTBEAT reports the effect later.
-            accepted_at = self._now() if accepted_at is None else accepted_at
             # A newer command may have been accepted before this one was abandoned.
             self._arming_accepted_at = max(self._arming_accepted_at, accepted_at)
 
-    def _supersede_arming(self, armed: bool | None) -> None:
-        if armed is None:
-            return
+    def _supersede_arm_commands(self, armed: bool) -> None:
+        """Count a new command to arm or disarm. It ends earlier ones, which are then not sent again."""
         self.arm_commands_sent += 1
         self.disarm_commands_sent += not armed
         self.last_arm_command = armed
         self.supersede(("arm",))
-        for sent in self._sent:
-            sent.on_newer_command(armed)
+        for sent in self._sent_commands:
+            sent.on_newer_arm_command(armed)
 
     # ------------------------------------------------------------------------- certainty
 
     @property
     def is_arm_command_open(self) -> bool:
         """True while a command to arm awaits its acknowledgement."""
-        return any(sent.arms for sent in self._sent)
+        return any(sent.arms for sent in self._sent_commands)
 
     @property
     def is_flown_by_program(self) -> bool:
@@ -391,17 +397,17 @@ class CommandArbiter:
         If the block raises another error than CommandRejected, or is cancelled, the mode stays distrusted until a later
         change is confirmed.
         """
-        change = next(self._order_numbers)
+        change_number = next(self._order_numbers)
         self._open_mode_changes += 1  # A new order may begin another mode change before this one is confirmed.
         try:
             yield
         except CommandRejected:  # The vehicle has not changed the mode.
             raise
         except BaseException:
-            self._doubt_change(change)
+            self._doubt_change(change_number)
             raise
         else:
-            self._confirmed_change = max(self._confirmed_change, change)
+            self._confirmed_change = max(self._confirmed_change, change_number)
         finally:
             self._open_mode_changes -= 1
 
@@ -413,44 +419,40 @@ class CommandArbiter:
         """Distrust the reported mode until a later mode change is confirmed."""
         self._doubt_change(next(self._order_numbers))
 
-    def _doubt_change(self, change: int) -> None:
-        self._doubted_change = max(self._doubted_change, change)
+    def _doubt_change(self, change_number: int) -> None:
+        self._doubted_change = max(self._doubted_change, change_number)
         self.mode_settles_at = self._now() + MODE_GRACE_S
 
     # ------------------------------------------------------------------------------- internals
 
-    def _create_order(
-        self, modes: Collection[Mode], ending_topics: Sequence[Topic], ends_flight: bool = False
+    def _new_order_expecting_late_modes(
+        self, modes: Collection[Mode], ending_topics: Sequence[Topic], *, ends_flight: bool = False
     ) -> Order:
         """Create an order that stays valid if an earlier order changes the mode late."""
         newest, present_mode = self.newest, self._telemetry.mode.latest
-        is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
-        is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
-        newest_modes = newest.modes if is_unsettled and newest is not None else ()
+        is_newest_in_progress = newest is not None and present_mode is not None and newest.may_cause(present_mode)
+        may_mode_change = is_newest_in_progress or self.mode_is_in_doubt or self._now() < self.mode_settles_at
+        newest_modes = newest.modes if may_mode_change and newest is not None else ()
         late_modes = self.late_modes()
-        return self._build_order(
-            modes,
-            ending_topics,
-            {mode.custom_mode for mode in (*newest_modes, *late_modes, *self._posted_modes())},
+        expected_modes = (*newest_modes, *late_modes, *self._unconfirmed_posted_modes())
+        return self._new_order(
+            modes=modes,
+            ending_topics=ending_topics,
+            expected={mode.custom_mode for mode in expected_modes},
             settles_at=self._now() + MODE_GRACE_S if late_modes else self.mode_settles_at,
             any_until=self._any_mode_until,
             ends_flight=ends_flight,
         )
 
-    def _build_order(
-        self, modes: Collection[Mode], ending_topics: Sequence[Topic], expected: Collection[int], **rules: Any
-    ) -> Order:
+    def _new_order(self, **options: Any) -> Order:
         return Order(
-            self._now(),
-            next(self._order_numbers),
-            self._is_newest,
-            ending_topics=ending_topics,
-            modes=modes,
+            given_at=self._now(),
+            number=next(self._order_numbers),
+            is_newest=self._is_newest,
             mode_before=self._telemetry.mode.latest,
-            expected=expected,
             armed_before=self._telemetry.armed.latest,
             state_before=self._telemetry.system_status.latest,
-            **rules,
+            **options,
         )
 
     def _all_end_flight(self, modes: Collection[Mode]) -> bool:
@@ -459,13 +461,13 @@ class CommandArbiter:
         ending_numbers = {mode.custom_mode for mode in ending_modes if mode is not None}
         return bool(modes) and {mode.custom_mode for mode in modes} <= ending_numbers
 
-    def _posted_modes(self) -> tuple[Mode, ...]:
-        unconfirmed_orders = [order for order in self._posted if not order.is_confirmed]
+    def _unconfirmed_posted_modes(self) -> tuple[Mode, ...]:
+        unconfirmed_orders = [order for order in self._posted_orders if not order.is_confirmed]
         return tuple(mode for order in unconfirmed_orders for mode in order.modes)
 
-    def _record_unreported(self, order: Order) -> None:
+    def _expect_late_effects(self, order: Order) -> None:
         now, present_mode = self._now(), self._telemetry.mode.latest
-        is_reported = present_mode is not None and order.is_own(present_mode)
+        is_reported = present_mode is not None and order.may_cause(present_mode)
         is_recent = now - order.given_at < MODE_GRACE_S  # An order with several modes may change the mode once more.
         if order.is_effect_due and (is_recent or not is_reported):
             self._unreported_modes.extend((now, mode) for mode in order.modes if mode != present_mode)
@@ -475,18 +477,18 @@ class CommandArbiter:
         since = self._now() - MODE_GRACE_S
         return tuple(mode for at, mode in self._unreported_modes if at > since)
 
-    def _is_steering(self) -> bool:
+    def _is_executing_newest(self) -> bool:
         order, mode = self.newest, self._telemetry.mode.latest
         return (
             order is not None
             and mode is not None
-            and order.is_own(mode)
+            and order.may_cause(mode)
             and not order.takeover_reason
             and not order.failsafe
         )
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
-        receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent)
+        receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent_commands)
         for receiver in receivers:
             receiver.on_mode(mode, self._telemetry.mode.updated_at)
 
@@ -501,22 +503,25 @@ class CommandArbiter:
             self._on_arming()
         if not armed:
             self.last_disarmed_report_at = self._telemetry.armed.updated_at
-        receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent)
+        receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent_commands)
         for receiver in receivers:
             receiver.on_armed(armed, self._telemetry.armed.updated_at)
 
     def _on_arming(self) -> None:
+        """If the program has armed the vehicle, create the order that records takeovers and failsafes from now on."""
         self.last_arming_at = self._telemetry.armed.updated_at
-        is_order_open = self.is_arm_command_open or any(order.armed for order in self._posted)
-        was_accepted = math.isfinite(self._arming_accepted_at)
-        was_caused_by_order = was_accepted and was_armed_by_order(
-            self.last_disarmed_report_at, self._arming_accepted_at
+        is_order_in_progress = self.is_arm_command_open or any(order.armed for order in self._posted_orders)
+        accepted_at = self._arming_accepted_at
+        is_effect_of_order = math.isfinite(accepted_at) and was_armed_by_order(
+            self.last_disarmed_report_at, accepted_at
         )
-        was_armed_by_program = is_order_open or was_caused_by_order
+        was_armed_by_program = is_order_in_progress or is_effect_of_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        self._arming_order = self._create_order(modes, ()) if was_armed_by_program else None
+        # Without topics, no newer order ends this order.
+        order = self._new_order_expecting_late_modes(modes, ending_topics=())
+        self._arming_order = order if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:
         arm_order = () if self._arming_order is None else (self._arming_order,)
-        return (*arm_order, *self._orders, *self._posted)
+        return (*arm_order, *self._orders_in_progress, *self._posted_orders)

@@ -99,10 +99,10 @@ class ArmingActions(VehicleBase):
                 self._session.end.raise_if_ended()
                 if self.connection.now() >= ask_at:
                     ask_at = math.inf
-                    await self._health.request_reasons(self.connection.now() - PREARM_REPORT_INTERVAL_S)
+                    await self._health.request_reasons(since=self.connection.now() - PREARM_REPORT_INTERVAL_S)
                 else:
                     await changes.next(min(timeout, ask_at - self.connection.now()))
-            return
+            return  # The vehicle is ready.
         # The time-out has expired. The vehicle may have become ready just after the last check.
         if missing := self._health.missing_for_flight():
             raise OperationTimeout(
@@ -169,38 +169,37 @@ class ArmingActions(VehicleBase):
         arming_mode = self._mode_to_arm_in(mode)
         if arming_mode is not None:
             await self._change_to_arming_mode(arming_mode)
-        self._arm_cleanup.stop()
+        self._arm_cleanup.stop_watching()
         if reason:
             logger.info("arming vehicle %d: %s", self.system_id, reason)
             self._session.send(Statustext(severity=MavSeverity.INFO, text=reason, id=0, chunk_seq=0))
         started = self.connection.now()
         try:
-            may_change_mode = mode is None
-            await self._arm_with_fallback_mode(may_change_mode, force, timeout, max_silence_s)
+            await self._arm_with_fallback_mode(force, timeout, max_silence_s, may_change_mode=mode is None)
         except CommandRejected as error:
             reasons = await self._health.arming_reasons(started)
             raise self._session.with_reasons(error, started, reasons) from None
 
     async def _arm_with_fallback_mode(
-        self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
+        self, force: bool, timeout: float, max_silence_s: float | None, *, may_change_mode: bool
     ) -> None:
+        """Arm. If the vehicle refuses in a mode in which a parameter may forbid arming, arm in another mode."""
         began_at = self.connection.now()
         order_before, arm_commands_before = self._arbiter.latest(STEERING), self._arbiter.arm_commands_sent
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
-            # Another task may have ordered something else since, above all to disarm.
+            # Another task may have ordered something else since, above all to disarm. One arm command is our own.
             is_newest_order = (
                 self._arbiter.latest(STEERING) is order_before
                 and self._arbiter.arm_commands_sent == arm_commands_before + 1
             )
-            has_open_stream = self._flight_cleanup.stop_stream is not None  # A stream needs its own mode.
             may_retry_in_other_mode = (
                 may_change_mode
                 and not has_computer_slept
                 and is_newest_order
-                and not has_open_stream
+                and not self._flight_cleanup.is_stream_open
                 and self.telemetry.is_confirmed_disarmed  # False if another party has armed the vehicle meanwhile.
                 and self._is_in_mode_armable_by_option()
             )
@@ -223,7 +222,7 @@ class ArmingActions(VehicleBase):
             except (anyio.get_cancelled_exc_class(), AerokitError) as error:
                 is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
                 if is_watched and isinstance(error, CommandTimeout):
-                    add_clause(error, self._arm_cleanup.hint())
+                    add_clause(error, self._arm_cleanup.late_arming_hint())
                 raise
 
     async def disarm(
@@ -247,7 +246,7 @@ class ArmingActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not disarm.
         """
-        self._arm_cleanup.stop()
+        self._arm_cleanup.stop_watching()
         started = self.connection.now()
         with self._arbiter.auxiliary_order(ends_flight=True) as order:
             try:
@@ -260,7 +259,7 @@ class ArmingActions(VehicleBase):
                 armed=False,
                 order=order,
                 started=started,
-                reported_after=accepted.disarmed_after,
+                reported_after=accepted.effect_reported_after,
                 timeout=remaining_s,
                 max_silence_s=max_silence_s,
             )
@@ -312,10 +311,9 @@ class ArmingActions(VehicleBase):
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return arming_mode
-        # A set-point stream needs the mode that it has set. A booting vehicle may still change its mode by itself, so a
-        # change now may be lost.
+        # A booting vehicle may still change its mode by itself, so a change now may be lost.
         is_booting = self.telemetry.system_status.latest in BOOT_STATES
-        must_keep_mode = self._flight_cleanup.stop_stream is not None or is_booting
+        must_keep_mode = self._flight_cleanup.is_stream_open or is_booting
         # If a parameter decides whether the mode allows arming, try to arm first: `_arm_with_fallback_mode` changes
         # the mode after a refusal.
         may_arm_in_mode = not self._health.unarmable_mode() or self._is_in_mode_armable_by_option()
@@ -378,7 +376,7 @@ class ArmingActions(VehicleBase):
         ):
             try:
                 await self._order_reboot(order, force)
-            except CommandRejected:
+            except CommandRejected:  # The vehicle will not reboot.
                 raise
             except (CommandTimeout, OperationRejected) as error:
                 # The reboot may have ended the order, and with it the wait for the acknowledgement.

@@ -40,7 +40,7 @@ class BackgroundTask:
         # Cancels the task; None before the first task, and once the task is done or cancelled.
         self._scope: Cancellation | None = None
         # Set when the latest task has ended, also after it was cancelled.
-        self._done: asyncio.Event | None = None
+        self._done = asyncio.Event()
 
     @property
     def is_open(self) -> bool:
@@ -77,19 +77,17 @@ class BackgroundTask:
         finally:
             self._scope = scope
 
-    async def finish(self, within_s: float) -> None:
-        if self._scope is None or self._done is None or not self._session.connection.is_open:
+    async def finish(self, max_wait_s: float) -> None:
+        """Wait until the task is done, at most ``max_wait_s`` seconds, and log a warning if it is not."""
+        if not self.is_open or not self._session.connection.is_open:
             return
-        if within_s:
+        if max_wait_s > 0:
             # Shielded, because the `async with` block may be left by a cancellation.
-            with anyio.CancelScope(shield=True), anyio.move_on_after(within_s):
+            with anyio.CancelScope(shield=True), anyio.move_on_after(max_wait_s):
                 await self._done.wait()
-        if self._scope is not None:
-            logger.warning(
-                "the async with block of this vehicle was left %s: %s",
-                self._warning_clause,
-                self._session.describe_link(),
-            )
+        if self.is_open:
+            link = self._session.describe_link()
+            logger.warning("the async with block of this vehicle was left %s: %s", self._warning_clause, link)
 
 
 # Seconds to wait for the acknowledgement of a hold at the end of the vehicle's `async with` block.
@@ -129,9 +127,10 @@ class FlightCleanup:
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order the vehicle to hold, even if it already is in the hold mode."""
-        order.only_stops = True
-        if self._holds_by_reposition:  # PX4 also flies to places in LOITER, its hold mode.
-            # PX4 acts on the loss of set-points after 1 s (COM_OF_LOSS_T), so a lost hold is repeated earlier.
+        order.only_stops = True  # From now on, `order` is sent even if the computer slept.
+        if self._holds_by_reposition:
+            # PX4 also flies to places in LOITER, its hold mode, so the mode alone does not stop it. PX4 acts on the
+            # loss of set-points after 1 s (COM_OF_LOSS_T), so a lost hold is repeated earlier.
             await self._sender.send_long(
                 order, *STOP_HERE, attempt_timeout=HOLD_ACK_TIMEOUT_S, attempts=self._max_attempts
             )
@@ -139,9 +138,15 @@ class FlightCleanup:
         else:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
 
+    def _hold_command(self, mode: Mode) -> tuple[float, ...]:
+        """Return the command that makes the vehicle hold, followed by its parameters."""
+        if self._holds_by_reposition:
+            return STOP_HERE
+        return (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
+
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
-        change_mode = (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
-        command, *params = STOP_HERE if self._holds_by_reposition else change_mode
+        """Wait for the acknowledgement of a hold that was just sent. Send the hold again if there is none."""
+        command, *params = self._hold_command(mode)
         await self._sender.send_long(
             order,
             int(command),
@@ -177,19 +182,13 @@ class FlightCleanup:
         # If `stop_in` was abandoned, its command was probably sent, and must not be repeated without a HEARTBEAT.
         can_send_now = self._arbiter.is_state_recent and not order.only_stops
         if can_send_now:
-            self._send_hold(mode)
+            command, *params = self._hold_command(mode)
+            self._session.commands.send_unconfirmed(int(command), *params)
+            # The new order replaces the abandoned one, whose modes the vehicle may still report.
             order = self._arbiter.order(*order.modes, mode)
             self._arbiter.doubt_mode()
         self._task.start(partial(self._complete_hold, mode, order, is_sent=can_send_now))
         return True
-
-    def _send_hold(self, mode: Mode) -> None:
-        if self._holds_by_reposition:
-            self._session.commands.send_unconfirmed(*STOP_HERE)
-        else:
-            self._session.commands.send_unconfirmed(
-                MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params
-            )
 
     async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
         """Wait for the confirmation of a hold. Without one, send it again after the next HEARTBEAT."""
@@ -200,8 +199,7 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    # Every new steering order cancels this task. The task protects itself while it gives an order of
-                    # its own.
+                    # Every new steering order cancels this task, except the one that the task gives itself.
                     with self._task.protected():
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)
@@ -236,9 +234,14 @@ class FlightCleanup:
             if self._awaited_order is order:
                 self._awaited_order = None
 
+    @property
+    def is_stream_open(self) -> bool:
+        """True while the program streams set-points, or is about to. A stream needs its own flight mode."""
+        return self.stop_stream is not None
+
     def check_no_stream(self) -> None:
         """Raise BusyError if a set-point stream is open."""
-        if self.stop_stream is not None:
+        if self.is_stream_open:
             raise BusyError("another set-point stream is open: leave it first; nothing was sent")
 
     @contextmanager
@@ -309,7 +312,7 @@ class ArmCleanup:
             if self._awaited == (order, was_armed):
                 self._awaited = None
 
-    def hint(self) -> str:
+    def late_arming_hint(self) -> str:
         unsent = self._session.connection.unsent_bytes
         hint = f"; {unsent} bytes are still in the send buffer" if unsent else ""
         return (
@@ -325,34 +328,35 @@ class ArmCleanup:
         if not self._is_newest_arm_command(order):
             return False
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
-        self._task.start(partial(self._watch_arming, order, was_armed, self._session.telemetry.mode.latest))
+        mode = self._session.telemetry.mode.latest
+        self._task.start(partial(self._watch_arming, order, was_armed, mode_when_abandoned=mode))
         return True
 
     def _is_newest_arm_command(self, order: Order) -> bool:
-        return order.arm_command == self._arbiter.arm_commands_sent
+        return order.arm_command_number == self._arbiter.arm_commands_sent
 
-    async def _watch_arming(self, order: Order, was_armed: bool, mode: Mode | None) -> None:
+    async def _watch_arming(self, order: Order, was_armed: bool, *, mode_when_abandoned: Mode | None) -> None:
         has_armed = False
         with anyio.move_on_after(ARM_WATCH_S):
             has_armed = await self._wait_until_armed(was_armed)
         if has_armed:
-            await self._undo_late_arming(order, mode)
+            await self._undo_late_arming(order, mode_when_abandoned)
 
     async def _wait_until_armed(self, was_armed: bool) -> bool:
         """Return False if the link ends before the vehicle arms."""
-        armed, since = self._session.telemetry.armed, self._session.connection.now()
+        armed, started = self._session.telemetry.armed, self._session.connection.now()
         try:
             if was_armed:  # An armed vehicle ignores the order until it disarms.
-                await armed.wait_until(lambda value: not value, description="disarmed")
-            await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
+                await armed.wait_until(lambda is_armed: not is_armed, description="disarmed")
+            await armed.wait_until(lambda is_armed: is_armed and armed.updated_at > started, description="armed")
         except AerokitError as error:
             logger.warning("the link ended while an arm command may still be executed: %s", error)
             return False
         return True
 
-    async def _undo_late_arming(self, order: Order, mode: Mode | None) -> None:
+    async def _undo_late_arming(self, order: Order, mode_when_abandoned: Mode | None) -> None:
         """Disarm the vehicle if the abandoned order has armed it."""
-        was_armed_by_order = await self._was_armed_by(order, mode)
+        was_armed_by_order = await self._was_armed_by(order, mode_when_abandoned)
         if not self._is_newest_arm_command(order) or self._session.telemetry.is_confirmed_disarmed:
             return
         if not was_armed_by_order:
@@ -369,34 +373,32 @@ class ArmCleanup:
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 
-    async def _was_armed_by(self, order: Order, mode: Mode | None) -> bool:
-        """Return True if this order, and no other party, has armed the vehicle.
-
-        ``mode`` is the mode that the vehicle reported when the order was abandoned.
-        """
+    async def _was_armed_by(self, order: Order, mode_when_abandoned: Mode | None) -> bool:
+        """Return True if this order, and no other party, has armed the vehicle."""
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
         # While the computer slept, another party had time to arm the vehicle.
         if self._arbiter.slept_since(order.given_at) > 0:
             return False
         mode_now, newest = self._session.telemetry.mode.latest, self._arbiter.newest
-        was_ordered = newest is not None and newest.number > order.number and newest.modes == (mode_now,)
+        was_mode_ordered = newest is not None and newest.number > order.number and newest.modes == (mode_now,)
         # A mode change that no newer order of this program explains is a takeover.
-        was_taken_over = order.takeover_reason or order.failsafe or not (mode_now == mode or was_ordered)
+        is_mode_explained = mode_now == mode_when_abandoned or was_mode_ordered
+        was_taken_over = order.takeover_reason or order.failsafe or not is_mode_explained
         if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
         # After a takeover or a late HEARTBEAT, only the acknowledgement shows that this order has armed the vehicle.
-        if not self._is_accepted(disarmed_at):
+        if not self._was_armed_by_accepted_command(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)
         # A vehicle that was disarmed meanwhile and is armed again was armed by another party.
         has_stayed_armed = self._arbiter.last_disarmed_report_at < armed_at
-        return has_stayed_armed and self._is_accepted(disarmed_at)
+        return has_stayed_armed and self._was_armed_by_accepted_command(disarmed_at)
 
-    def _is_accepted(self, disarmed_at: float) -> bool:
+    def _was_armed_by_accepted_command(self, disarmed_at: float) -> bool:
         accepted_at = self._session.commands.accepted_at(MavCmd.COMPONENT_ARM_DISARM)
         return was_armed_by_order(disarmed_at, accepted_at)
 
-    def stop(self) -> None:
+    def stop_watching(self) -> None:
         self._task.cancel()
 
     async def finish(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
@@ -22,15 +22,20 @@ Vector = tuple[float, float]
 """Metres north and east."""
 
 
-class ClosedPath:
-    """A closed curve around a center, with a phase that increases by 2π each round.
+class PathPoint(NamedTuple):
+    """Place relative to the center of a path, and its first and second derivative by the phase."""
 
-    ``at(phase)`` returns the place relative to the center, and its first and second derivative by the phase.
-    """
+    place: Vector
+    tangent: Vector
+    second_derivative: Vector
+
+
+class ClosedPath:
+    """A closed curve around a center, with a phase that increases by 2π each round."""
 
     first_phase: float = 0.0
 
-    def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
+    def at(self, phase: float) -> PathPoint:
         raise NotImplementedError
 
 
@@ -42,10 +47,10 @@ class Circle(ClosedPath):
         self._direction = 1 if clockwise else -1
         self.first_phase: float = first_phase
 
-    def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
+    def at(self, phase: float) -> PathPoint:
         bearing = self.first_phase + self._direction * (phase - self.first_phase)
         north, east = self._radius_m * math.cos(bearing), self._radius_m * math.sin(bearing)
-        return (north, east), (-self._direction * east, self._direction * north), (-north, -east)
+        return PathPoint((north, east), (-self._direction * east, self._direction * north), (-north, -east))
 
 
 class Eight(ClosedPath):
@@ -55,9 +60,9 @@ class Eight(ClosedPath):
         self._major_m, self._axis = major_m, math.radians(axis_deg)
         self._minor_m = minor_m if clockwise else -minor_m
 
-    def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
+    def at(self, phase: float) -> PathPoint:
         major_m, minor_m = self._major_m, self._minor_m
-        return (
+        return PathPoint(
             self._to_north_east(major_m * math.sin(phase), -minor_m * math.sin(2 * phase)),
             self._to_north_east(major_m * math.cos(phase), -2 * minor_m * math.cos(2 * phase)),
             self._to_north_east(-major_m * math.sin(phase), 4 * minor_m * math.sin(2 * phase)),
@@ -69,7 +74,7 @@ class Eight(ClosedPath):
         return along * cos - across * sin, along * sin + across * cos
 
 
-class PathFlight:
+class PathSetpoints:
     """Moves a set-point straight to the start of a path, stops it there, and then moves it along the path to its end.
 
     ``initial_offset`` is the vehicle's position when the flight begins, relative to the center of the path (north,
@@ -108,29 +113,26 @@ class PathFlight:
         return self._advance_on_path(seconds) if self.is_on_path else self._advance_to_path(seconds)
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
-        (path_north, path_east), _, _ = self._path.at(self._path.first_phase)
+        path_north, path_east = self._path.at(self._path.first_phase).place
         start_north, start_east, start_down = self._initial_offset
         to_path = (path_north - start_north, path_east - start_east, -start_down)  # The path is at down = 0.
         length_m = math.hypot(*to_path)
-        self._change_speed(seconds, length_m - self._flown_m)
+        self._change_speed(seconds, remaining_m=length_m - self._flown_m)
         self._flown_m += self._present_speed_m_s * seconds
         if self._flown_m >= length_m:
             self.is_on_path = True
             self._flown_m = length_m
             self._present_speed_m_s = 0.0
-        fraction = self._flown_m / length_m if length_m else 1.0
-        north, east, down = (
-            coordinate + fraction * component
-            for coordinate, component in zip(self._initial_offset, to_path, strict=True)
-        )
-        speed = self._present_speed_m_s
-        north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)
-        return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), (0.0, 0.0))
+        # The unit vector towards the path; zero if the set-point begins there.
+        to_north, to_east, to_down = (component / length_m if length_m else 0.0 for component in to_path)
+        flown_m, speed = self._flown_m, self._present_speed_m_s
+        place = (start_north + flown_m * to_north, start_east + flown_m * to_east)
+        velocity = (speed * to_north, speed * to_east, speed * to_down)
+        return self._setpoint(place, start_down + flown_m * to_down, velocity, acceleration=(0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:
-        _, tangent, _ = self._path.at(self._phase)
-        metres_per_radian = math.hypot(*tangent)
-        self._change_speed(seconds, (self._last_phase - self._phase) * metres_per_radian)
+        metres_per_radian = math.hypot(*self._path.at(self._phase).tangent)
+        self._change_speed(seconds, remaining_m=(self._last_phase - self._phase) * metres_per_radian)
         self._phase = min(self._phase + self._present_speed_m_s * seconds / metres_per_radian, self._last_phase)
         if self.is_complete:
             self._present_speed_m_s = 0.0
@@ -146,7 +148,8 @@ class PathFlight:
             (curve_north - parallel_factor * tangent_north) * phase_rate**2,
             (curve_east - parallel_factor * tangent_east) * phase_rate**2,
         )
-        return self._setpoint(place, 0.0, (tangent_north * phase_rate, tangent_east * phase_rate, 0.0), centripetal)
+        velocity = (tangent_north * phase_rate, tangent_east * phase_rate, 0.0)
+        return self._setpoint(place, down=0.0, velocity=velocity, acceleration=centripetal)
 
     def _change_speed(self, seconds: float, remaining_m: float) -> None:
         """Accelerate to the ordered speed, or brake so that the set-point can stop after ``remaining_m``."""

@@ -34,8 +34,8 @@ class VehicleContext:
 
     def __init__(self, session: VehicleSession) -> None:
         self.session = session
-        self.arbiter: CommandArbiter = CommandArbiter(session.connection.now, session.telemetry)
-        self.arbiter.slept_since = session.connection._slept_since
+        connection = session.connection
+        self.arbiter: CommandArbiter = CommandArbiter(connection.now, session.telemetry, connection._slept_since)
         self.sender: OrderSender = OrderSender(session, self.arbiter)
         self.flight_cleanup: FlightCleanup = FlightCleanup(session, self.arbiter, self.sender)
         self.arm_cleanup: ArmCleanup = ArmCleanup(session, self.arbiter, self.sender)

@@ -92,11 +92,8 @@ class FlightActions(VehicleBase):
                 f"take_off: the vehicle is already {IN_THE_AIR[landed.latest]}: use go_to() to climb; nothing was sent"
             )
         # The modes that the vehicle may report during the take-off.
-        modes = (
-            plan.mode,
-            plan.mode_after,
-            self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol),
-        )
+        take_off_mode = self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol)
+        modes = (plan.mode, plan.mode_after, take_off_mode)
         order = self._arbiter.order(*(mode for mode in modes if mode is not None))
         try:
             with self._flight_cleanup.flying(order):
@@ -157,7 +154,7 @@ class FlightActions(VehicleBase):
             return lambda: False  # The climb may be the effect of an earlier command.
         # Without a recent altitude, the climb is measured from the first one that is received.
         is_start_known = self._position.was_received_since(started - POSITION_MAX_AGE_S)
-        start_m = self._position.altitude_amsl() if is_start_known else -math.inf
+        start_m = self._position.altitude_amsl() if is_start_known else -math.inf  # −inf: unknown
         state_before = landed.latest
 
         def is_rising() -> bool:
@@ -176,20 +173,20 @@ class FlightActions(VehicleBase):
     ) -> None:
         # A vehicle that hovers at the altitude may be slightly below it, but not on the ground.
         tolerance_m = min(max(0.5, 0.05 * altitude_m), 0.5 * altitude_m)
-        is_amsl = self.autopilot.take_off_needs_home()
         started = self.connection.now()
-
         # The vehicle keeps the altitude that it climbs to when home moves: PX4 corrects the altitude of home in flight,
-        # and `set_home` may be called during the climb.
-        target_amsl_m: float | None = plan.params[6] if is_amsl else None
+        # and `set_home` may be called during the climb. The target is therefore an altitude above mean sea level:
+        # param7 of PX4's command, otherwise computed from the first known position.
+        target_amsl_m: float | None = plan.params[6] if self.autopilot.take_off_needs_home() else None
 
         def missing_m() -> float:
             nonlocal target_amsl_m
-            here_m, climb_m = self._position.altitude_amsl(), altitude_m - self._position.altitude_relative()
-            is_known = self._position.was_received_since(started) and math.isfinite(here_m + climb_m)
-            if target_amsl_m is None and is_known:
-                target_amsl_m = here_m + climb_m
-            return climb_m if target_amsl_m is None else target_amsl_m - here_m
+            here_amsl_m = self._position.altitude_amsl()
+            missing_above_home_m = altitude_m - self._position.altitude_relative()
+            target_m = here_amsl_m + missing_above_home_m
+            if target_amsl_m is None and self._position.was_received_since(started) and math.isfinite(target_m):
+                target_amsl_m = target_m
+            return missing_above_home_m if target_amsl_m is None else target_amsl_m - here_amsl_m
 
         def is_up() -> bool:
             return self._position.was_received_since(started) and missing_m() <= tolerance_m and not order.end

@@ -175,7 +175,7 @@ class FollowStream(SteeringStream[TargetState]):
                 " nothing was sent"
             )
         unknown = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)  # replaced when the stream is entered
-        super().__init__(context, self._encode_place, unknown, RATE_HZ, valid_for_s, MAX_LAG_S)
+        super().__init__(context, self._encode_place, unknown, RATE_HZ, valid_for_s=valid_for_s, max_lag_s=MAX_LAG_S)
         self._target = target
         self._tracker = FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
@@ -223,6 +223,7 @@ class FollowStream(SteeringStream[TargetState]):
         mode = self._stream_mode()
         self._start_reading()
         try:
+            # The base class uses `_prepared_order` to change the mode.
             with self._context.flight_cleanup.preparing_stream(mode) as self._prepared_order:
                 self._value = await self._first_state()
                 self._choose_place(self._value)
@@ -258,7 +259,8 @@ class FollowStream(SteeringStream[TargetState]):
                 except Exception as error:
                     self._end_reason = f"the positions of the target raised {error!r}"
                 except asyncio.CancelledError:
-                    # The iterator raises CancelledError if it awaits a cancelled task.
+                    # `_stop_reading` resets `_reading` before it cancels `scope`. Otherwise the iterator itself has
+                    # raised CancelledError, because it awaits a cancelled task.
                     if self._reading is scope:
                         self._end_reason = "the reading of the target was cancelled"
                     raise
@@ -287,8 +289,8 @@ class FollowStream(SteeringStream[TargetState]):
         here, target = self._session.telemetry.position.fresh(POSITION_MAX_AGE_S), state.position
         # Until the target moves, its course is unknown: assume that it moves away from the vehicle.
         self._course_deg = here.bearing_to(target)
-        present_deg = target.bearing_to(here) - self._reference_deg(state)
-        self._bearing_deg = present_deg if self._place.bearing_deg is None else self._place.bearing_deg
+        present_bearing_deg = target.bearing_to(here) - self._zero_bearing_deg(state)
+        self._bearing_deg = present_bearing_deg if self._place.bearing_deg is None else self._place.bearing_deg
         if self._place.height_m is None:
             if here.altitude_amsl_m is None:
                 raise OperationRejected(
@@ -320,7 +322,7 @@ class FollowStream(SteeringStream[TargetState]):
                 self._end_reason = f"the vehicle cannot follow the position of the target: {error}"
             else:
                 self._set_at = state.reported_at  # The age of a value is the age of the target's position.
-        super()._tick(due)
+        super()._tick(due)  # Sends the value, or stops the stream because of `_end_reason`.
 
     def _stop_reason(self, lag: float) -> str | None:
         if self._end_reason:
@@ -329,8 +331,8 @@ class FollowStream(SteeringStream[TargetState]):
             return f"the target is {self.distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
         return super()._stop_reason(lag)
 
-    def _reference_deg(self, state: TargetState) -> float:
-        """Return the target's course if bearings are measured from it, otherwise 0 (north)."""
+    def _zero_bearing_deg(self, state: TargetState) -> float:
+        """Return the direction from which bearings are measured: the target's course, or 0 (north)."""
         north_m_s, east_m_s, _ = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
             self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
@@ -340,7 +342,7 @@ class FollowStream(SteeringStream[TargetState]):
         # The target is assumed to keep its velocity between two positions.
         moved_for_s = max(0.0, min(self._now() - state.first_reported_at, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
-        bearing = math.radians(self._reference_deg(state) + self._bearing_deg)
+        bearing = math.radians(self._zero_bearing_deg(state) + self._bearing_deg)
         distance_m = self._place.distance_m
         goal = state.position.offset(
             north_m=distance_m * math.cos(bearing) + north_m_s * moved_for_s,

@@ -74,12 +74,11 @@ class ImpactDetector:
         self._sank_fast_at = -math.inf
         # Maximum sink rate of the present or last fast descent.
         self._max_sink_m_s = 0.0
-        # Sink rate before the impact, and height of the vehicle at the impact. The sink rate is None if there was no
-        # impact.
-        self._impact_m_s: float | None = None
+        # Sink rate before the impact (None if there was none), and altitude of the vehicle at the impact.
+        self._impact_sink_m_s: float | None = None
         self._impact_altitude_m: float | None = None
-        # Height before the descent; None if it is unknown.
-        self._top_m: float | None = None
+        # None if it is unknown.
+        self._altitude_before_descent_m: float | None = None
         # True once the vehicle was slow over ground after the impact.
         self._has_slowed = False
 
@@ -88,7 +87,7 @@ class ImpactDetector:
         cell = self._telemetry.velocity
         velocity, updated_at = cell.latest, cell.updated_at
         if velocity is None or updated_at == self._updated_at:
-            return
+            return  # There is no new velocity.
         if updated_at < self._updated_at:  # The computer slept, and aerokit has moved the times of all values back.
             self._updated_at, self._sank_fast_at = updated_at, -math.inf
             return
@@ -104,13 +103,13 @@ class ImpactDetector:
             self._on_sudden_stop()
         elif _has_changed(self._impact_altitude_m, altitude_amsl(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.
-            self._impact_m_s = None
+            self._impact_sink_m_s = None
             self._impact_altitude_m = None
         # The next descent begins at the altitude of the last report without a descent.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
-            self._top_m = self.current_altitude()
+            self._altitude_before_descent_m = self.current_altitude()
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
-        self._has_slowed = self._impact_m_s is not None and (self._has_slowed or is_slow)
+        self._has_slowed = self._impact_sink_m_s is not None and (self._has_slowed or is_slow)
 
     def _on_fast_descent(self, sink_m_s: float, *, is_continued: bool) -> None:
         max_sink_before_m_s = self._max_sink_m_s if is_continued else 0.0
@@ -118,19 +117,19 @@ class ImpactDetector:
         self._sank_fast_at = self._updated_at
 
     def _on_sudden_stop(self) -> None:
-        altitude_m = self.current_altitude()
-        drop_m = None if self._top_m is None or altitude_m is None else self._top_m - altitude_m
+        top_m, altitude_m = self._altitude_before_descent_m, self.current_altitude()
+        drop_m = None if top_m is None or altitude_m is None else top_m - altitude_m
         # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
         if drop_m is None or drop_m >= MIN_DROP_M:
-            self._impact_m_s = self._max_sink_m_s
+            self._impact_sink_m_s = self._max_sink_m_s
             # Even an old altitude is needed, so that a later altitude can show that the vehicle flies on.
             self._impact_altitude_m = altitude_amsl(self._telemetry)
 
     def describe(self) -> str:
         """Return a text about the impact; empty if there was none."""
-        if self._impact_m_s is None or not self._has_slowed:
+        if self._impact_sink_m_s is None or not self._has_slowed:
             return ""
-        return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
+        return f"{HIT_GROUND} at {self._impact_sink_m_s:.1f} m/s"
 
     def current_altitude(self) -> float | None:
         """Return the altitude above mean sea level in metres; None if no recent position reports it."""
@@ -150,8 +149,8 @@ class GroundCheck:
         self._impact = ImpactDetector(session.telemetry)
         self._reboots_before = session.watch.reboots
         # Time of the report that the vehicle is on the ground, and altitude above sea level at that time.
-        self._reported_at: float | None = None
-        self._reported_altitude_m: float | None = None
+        self._ground_reported_at: float | None = None
+        self._ground_altitude_m: float | None = None
         # Time since which the vehicle moves up or down slower than SETTLED_M_S; infinite while it moves faster.
         self._settled_since = math.inf
 
@@ -166,31 +165,32 @@ class GroundCheck:
 
     @property
     def is_reported_on_ground(self) -> bool:
-        return self._reported_at is not None
+        return self._ground_reported_at is not None
 
     def confirms(self, is_reported: bool) -> bool:
         """Return True if the vehicle is reported on the ground, has settled since, and did not fall."""
         now = self._session.connection.now()
         self._impact.update()
         if not is_reported:
-            self._reported_at = None
+            self._ground_reported_at = None
             return False
-        if self._reported_at is None:
-            self._reported_at = now
+        if self._ground_reported_at is None:
+            self._ground_reported_at = now
             self._settled_since = math.inf
-            self._reported_altitude_m = self._impact.current_altitude()
+            self._ground_altitude_m = self._impact.current_altitude()
         return self._has_settled(now) and not self._impact.describe() and not self._has_rebooted
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
+        """Return a text about a fall once the vehicle is reported on the ground; before that, ``in_flight()``."""
         return self.fall() if self.is_reported_on_ground else in_flight()
 
     def fall(self) -> str | None:
         """Return a text if the vehicle fell or is falling."""
         if self._has_rebooted:  # Its motors have stopped, and it reports neither its fall nor its former state.
             return "the vehicle rebooted"
-        telemetry = self._session.telemetry
-        is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
-        if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:
+        telemetry, reported_at = self._session.telemetry, self._ground_reported_at
+        is_velocity_newer = reported_at is not None and telemetry.velocity.updated_at > reported_at
+        if is_velocity_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:
             return f"the vehicle was disarmed in the air and sinks at {self._down_m_s():.1f} m/s"
         return self._impact.describe() or None
 
@@ -201,17 +201,16 @@ class GroundCheck:
     def _has_settled(self, now: float) -> bool:
         """Return True if the vehicle has stopped climbing or sinking."""
         velocity_at = self._session.telemetry.velocity.updated_at
-        reported_at = now if self._reported_at is None else self._reported_at
+        reported_at = now if self._ground_reported_at is None else self._ground_reported_at
         if now - velocity_at > VELOCITY_MAX_AGE_S:
-            # Without a recent velocity, the report that the vehicle is on the ground is sufficient.
-            return True
+            return True  # Without a recent velocity, the report that the vehicle is on the ground is sufficient.
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
             # The reported velocity may be wrong: if the height has not changed for STANDING_S, the vehicle stands on
             # the ground. `current_altitude` ignores old heights, which would not change in a fall either.
             altitude_m = self._impact.current_altitude()
-            is_known = altitude_m is not None and self._reported_altitude_m is not None
-            is_still = is_known and not _has_changed(self._reported_altitude_m, altitude_m, STANDING_M)
+            is_known = altitude_m is not None and self._ground_altitude_m is not None
+            is_still = is_known and not _has_changed(self._ground_altitude_m, altitude_m, STANDING_M)
             return is_still and now - reported_at >= STANDING_S
         self._settled_since = min(self._settled_since, max(velocity_at, reported_at))
         return velocity_at >= self._settled_since + SETTLING_S

@@ -240,7 +240,7 @@ class SetpointStream(SteeringStream[SetpointT]):
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)
-        if isinstance(initial, BRAKED_BY_AUTOPILOT):  # Others may stop it suddenly without an impact.
+        if isinstance(initial, BRAKED_BY_AUTOPILOT):  # Other set-points may stop the vehicle suddenly in the air.
             self._impact = ImpactDetector(context.session.telemetry)
 
     def set(self, setpoint: SetpointT) -> None:

@@ -31,7 +31,7 @@ REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
-def join_reasons(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
+def ordered_reasons(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
     """Join the reasons about missing or old reports with the others. Reports that decide about arming come first."""
     first = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
     last = [reason for reason in report_reasons if reason not in first]
@@ -45,7 +45,7 @@ class Health:
         self._session, self._telemetry, self._autopilot = session, session.telemetry, session.autopilot
         # Times at which the link was last restored, and at which the vehicle was last requested to run its checks.
         self._restored_at = -math.inf
-        self._checked_at = -math.inf
+        self._checks_requested_at = -math.inf
         session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))
 
     def _on_restored(self, event: LinkRestored) -> None:
@@ -60,28 +60,29 @@ class Health:
             for cell in (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home)
             if not cell.is_known
         ]
-        texts = self._recent_texts()
-        is_explained = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
-        unexplained = self._unnamed_reasons() if self._checks_fail() and not is_explained else []
-        return join_reasons([*missing, *self._outdated_states()], [*texts, *self._health_problems(), *unexplained])
+        texts = self._recent_arming_reasons()
+        is_explained = texts or self._failing_sensors() or (self._mode_needs_position() and self._missing_estimates())
+        unexplained = self._unexplained_failures() if self._prearm_checks_fail() and not is_explained else []
+        other_reasons = [*texts, *self._health_problems(), *unexplained]
+        return ordered_reasons([*missing, *self._outdated_states()], other_reasons)
 
-    def _recent_texts(self) -> list[str]:
+    def _recent_arming_reasons(self) -> list[str]:
         """Return why pre-arm checks fail, from recent status texts."""
-        if not self._checks_fail() or self._telemetry.is_armed:
+        if not self._prearm_checks_fail() or self._telemetry.is_armed:
             return []
         now = self._session.connection.now()
         # Texts from before the last request to run the checks, or from before the link was restored, may be outdated.
-        since = max(now - PREARM_REPORT_INTERVAL_S, self._checked_at, self._restored_at)
-        reasons = [
+        since = max(now - PREARM_REPORT_INTERVAL_S, self._checks_requested_at, self._restored_at)
+        timed_reasons = [
             (text.at, reason)
             for text in self._telemetry.texts_since(since)
             if (reason := self._autopilot.arming_reason(text.text))
         ]
-        if self._autopilot.runs_prearm_checks and reasons:
+        if self._autopilot.runs_prearm_checks and timed_reasons:
             # ArduPilot reports all failing checks together, so older texts may be about checks that pass now.
-            report_at = max(at for at, _ in reasons) - PREARM_REPORT_DURATION_S
-            reasons = [(at, reason) for at, reason in reasons if at >= report_at]
-        return list(dict.fromkeys(reason for _, reason in reasons))
+            last_report_at = max(at for at, _ in timed_reasons) - PREARM_REPORT_DURATION_S
+            timed_reasons = [(at, reason) for at, reason in timed_reasons if at >= last_report_at]
+        return list(dict.fromkeys(reason for _, reason in timed_reasons))  # without duplicates
 
     def _outdated_states(self) -> list[str]:
         telemetry = self._telemetry
@@ -114,16 +115,16 @@ class Health:
         """
         with self._session.streaming("sensors", "estimator"):
             await self._session.wait_for_status_texts()
-            await self._request_texts(since)
-            await self._refresh()
-        problems = self._health_problems() if self._needs_position() else self._failing_sensors()
+            await self._request_checks_unless_reported(since)
+            await self._await_recent_health()
+        problems = self._health_problems() if self._mode_needs_position() else self._failing_sensors()
         other_reasons = [*self.arming_texts(since), *self.unarmable_mode(), *problems]
-        reasons = self._session.deduplicate_reasons(*join_reasons(self._outdated_states(), other_reasons))
-        if not reasons and self._checks_fail():
-            return tuple(self._unnamed_reasons())
+        reasons = self._session.deduplicate_reasons(*ordered_reasons(self._outdated_states(), other_reasons))
+        if not reasons and self._prearm_checks_fail():
+            return tuple(self._unexplained_failures())
         return reasons
 
-    def _unnamed_reasons(self) -> list[str]:
+    def _unexplained_failures(self) -> list[str]:
         """Return reasons for failing checks that the vehicle does not explain: low batteries, else a general text."""
         low_batteries = []  # from BATTERY_STATUS, because PX4 sends its status text about a low battery only once
         for battery in self._telemetry.batteries.latest or ():
@@ -135,7 +136,7 @@ class Health:
                 low_batteries.append(f"battery {battery.id + 1} reports the charge state {state}{charge}")
         return low_batteries or [CHECKS_FAIL]
 
-    def _needs_position(self) -> bool:
+    def _mode_needs_position(self) -> bool:
         mode = self._telemetry.mode.latest
         return mode is None or mode.name not in self._autopilot.modes_without_position
 
@@ -145,20 +146,19 @@ class Health:
         return [self.unarmable_text(mode)] if mode is not None and mode.name in self._unarmable_modes() else []
 
     def unarmable_text(self, mode: Mode) -> str:
-        option = self._autopilot.armable_by_option.get(mode.name)
+        firmware, option = self._autopilot.firmware, self._autopilot.armable_by_option.get(mode.name)
         armable_modes = ", ".join(sorted({*self._autopilot.modes.names} - self._unarmable_modes()))
         if option is None:
-            text = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {armable_modes}"
+            text, when = f"{firmware} cannot arm in {mode.name}, only in {armable_modes}", "first"
         else:
-            text = f"{self._autopilot.firmware} cannot arm in {mode.name} unless {option} allows it"
+            text, when = f"{firmware} cannot arm in {mode.name} unless {option} allows it", "after a refusal"
         arming_mode = self._autopilot.mode_to_arm_in()
-        when = "first" if option is None else "after a refusal"
         return text if arming_mode is None else f"{text}; arm() changes to {arming_mode.name} {when}"
 
     def _unarmable_modes(self) -> frozenset[str]:
         return self._autopilot.unarmable_modes.union(self._autopilot.armable_by_option)
 
-    async def _refresh(self) -> None:
+    async def _await_recent_health(self) -> None:
         """Wait briefly for states that are missing or too old."""
         with anyio.move_on_after(REPORT_WAIT_S):
             await self._telemetry.sensors.wait_until(lambda _: self._telemetry.sensors.age <= HEALTH_MAX_AGE_S)
@@ -168,9 +168,9 @@ class Health:
         """Request the status texts about failing pre-arm checks, unless some have arrived since the time ``since``."""
         sensors = self._telemetry.sensors.latest
         if sensors is not None and sensors.prearm_checks_pass is False and not self._telemetry.is_armed:
-            await self._request_texts(since)
+            await self._request_checks_unless_reported(since)
 
-    async def _request_texts(self, since: float) -> None:
+    async def _request_checks_unless_reported(self, since: float) -> None:
         """Let the vehicle run its pre-arm checks, unless it has sent texts about arming since the time ``since``."""
         if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
             return
@@ -179,7 +179,7 @@ class Health:
             await self._session.commands.send_long(MavCmd.RUN_PREARM_CHECKS, attempts=2)
         except (CommandRejected, CommandTimeout):
             return
-        self._checked_at = requested_at
+        self._checks_requested_at = requested_at
         await anyio.sleep(REPORT_WAIT_S)
 
     def arming_texts(self, since: float) -> list[str]:
@@ -198,7 +198,7 @@ class Health:
         # The probable cause comes first.
         return [*causes, *(f"the estimator has no {name} ({estimator.message})" for name in estimator.missing)]
 
-    def _checks_fail(self) -> bool:
+    def _prearm_checks_fail(self) -> bool:
         sensors = self._telemetry.sensors.latest
         return sensors is not None and sensors.prearm_checks_pass is False and not self._reports_mode_requirements()
 

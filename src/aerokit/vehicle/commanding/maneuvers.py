@@ -147,13 +147,14 @@ class ManeuverActions(VehicleBase):
             check_range("rounds", rounds, 0, MAX_ROUNDS, above=True)
             if rounds * 2 != int(rounds * 2):
                 raise InvalidArgument(f"rounds = {rounds!r} is not allowed: it must be a multiple of 0.5")
-        is_flown_by_px4 = self._is_on_wings and self.autopilot.circles_by == "orbit"
-        if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
+        can_use_command = self._is_on_wings and self.autopilot.circles_by == "orbit"  # a PX4 fixed wing
+        can_use_setpoints = not self._is_on_wings and self.autopilot.setpoints.trajectory
+        if not (can_use_command or can_use_setpoints):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
         counter = LobeCounter(major_radius_m, axis_deg)
         limits = FlightLimits(max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "figure_eight", travel_target(center), counter, rounds, limits)
-        if is_flown_by_px4:
+        if can_use_command:
             major_m = major_radius_m if clockwise else -major_radius_m
             axis_rad = math.radians(math.remainder(axis_deg, 360))  # The command allows -pi to pi.
             params = (major_m, minor_radius_m, math.nan, axis_rad)
@@ -224,9 +225,10 @@ class ManeuverActions(VehicleBase):
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)
         else:
             counter = TurnCounter(radius_m, clockwise=clockwise)
-            command, params, mode = self._circle_command("loiter", radius_m, math.nan, "free", clockwise=clockwise)
+            command, params, mode = self._circle_command("loiter", radius_m, clockwise=clockwise)
         limits = FlightLimits(max_distance_m, timeout, max_silence_s)
-        flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits, center_name="target")
+        rounds = turns or 0.0  # With 0, the flight ends after the arrival and the stay.
+        flight = RoundFlight(self._context, "loiter", center, counter, rounds, limits, center_name="target")
         await flight.fly_by_command(
             command, params, mode, holds_at_end=False, stay_s=duration_s or 0.0, radius_m=radius_m or 0.0
         )
@@ -277,7 +279,7 @@ class ManeuverActions(VehicleBase):
         return FollowStream(self._context, target, place, valid_for_s, max_distance_m)
 
     def _circle_command(
-        self, operation: str, radius_m: float, speed_m_s: float, facing: Facing, *, clockwise: bool
+        self, operation: str, radius_m: float, speed_m_s: float = math.nan, facing: Facing = "free", *, clockwise: bool
     ) -> tuple[int, tuple[float, ...], Mode]:
         """Return the command that circles a place, its first four parameters, and the mode that it leads to."""
         if self.autopilot.circles_by == "orbit":
@@ -326,13 +328,13 @@ class ManeuverActions(VehicleBase):
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()
             await self._sender.send_long(order, MavCmd.DO_VTOL_TRANSITION, float(target_state))
-            impact = self._sender.impact_failure(order)
+            describe_impact = self._sender.impact_failure(order)
             with self._session.streaming("vtol_state"):
                 await await_progress(
                     self._session,
                     f"transition_to({state})",
                     is_done=lambda: cell.latest == target_state and cell.updated_at > started,
-                    failure_reason=lambda: impact() or order.takeover_reason,
+                    failure_reason=lambda: describe_impact() or order.takeover_reason,
                     describe=lambda: f"MAV_VTOL_STATE is {cell.latest}",
                     timeout=timeout,
                 )

@@ -65,6 +65,7 @@ REQUIRED_STATES = (
 
 @contextmanager
 def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
+    """Request all streams during a `with` block, and again if the vehicle may have lost the request."""
     check_range("rate_hz", rate_hz, 0, 1000, above=True)
     tasks = BackgroundTasks(session.connection.fail)
     with ExitStack() as cleanup:
@@ -267,7 +268,7 @@ class MessagingActions(VehicleBase):
         elif isinstance(message, (CommandInt, CommandLong, SetMode)):
             order = self._arbiter.raw_order(subjects, modes=self._modes_of(message))
             order.was_sent = True
-        else:  # Set-points and mission messages end orders by `post`, but not the action in progress.
+        else:  # Set-points and mission messages end posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
 
     def _modes_of(self, message: CommandInt | CommandLong | SetMode) -> tuple[Mode, ...]:
@@ -311,7 +312,7 @@ class MessagingActions(VehicleBase):
         if "arm" in subjects and armed is None:
             raise InvalidArgument("posted(): the subject 'arm' requires armed=True or armed=False")
         with (
-            self._arbiter.post(subjects, modes=modes, armed=armed) as order,
+            self._arbiter.posted_order(subjects, modes=modes, armed=armed) as order,
             PostedOrder(self._session, self._arbiter, self._sender, order) as posted,
         ):
             yield posted

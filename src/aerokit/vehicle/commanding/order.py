@@ -184,14 +184,14 @@ class Order:
 
         CURRENT_MODE may report the mode before the HEARTBEAT that reports the mode and, after a landing, disarming.
         """
-        self.arm_command: int | None = None
+        self.arm_command_number: int | None = None
         """Sequence number of the order's arm or disarm command; None until the command was sent."""
         self.was_sent: bool = False
         """True once the first transmission of the order's first command began."""
         self.only_stops: bool = False
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_closed: bool = False
-        """True once the `with` block of the posted order was left."""
+        """True once the `with` block of `CommandArbiter.posted_order` was left."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
         # Sets of modes, by their numbers in HEARTBEAT.custom_mode. The docstring of the class describes the kinds.
@@ -232,10 +232,10 @@ class Order:
         """True if a later HEARTBEAT may show that the order took effect."""
         return self.was_sent and not (self.is_confirmed or self.was_refused or self.takeover_reason)
 
-    def is_own(self, mode: Mode) -> bool:
+    def may_cause(self, mode: Mode) -> bool:
         return mode.custom_mode in self._own_modes
 
-    def expect(self, modes: Collection[Mode], *, any_until: float = -math.inf) -> None:
+    def accept_as_effects(self, modes: Collection[Mode], *, any_until: float = -math.inf) -> None:
         """Also accept these modes as effects of the order, and every mode until ``any_until``."""
         self._own_modes |= {mode.custom_mode for mode in modes}
         self.any_mode_until = max(self.any_mode_until, any_until)
@@ -257,17 +257,18 @@ class Order:
     # -------------------------------------------------------------------- vehicle reports
 
     def on_mode(self, mode: Mode, reported_at: float) -> None:
+        """Decide whether a reported mode is due to this order, an earlier order, a raw command or another party."""
         number = mode.custom_mode
         is_first_report = self._mode_now is None
         is_change = not is_first_report and number != self._mode_now
-        is_settled = reported_at >= self.settles_at
-        is_expected = number in self._expected_modes and number in self._accepted_modes
-        is_own_effect = self.was_sent and number in self._own_modes
-        if is_change and (is_own_effect or is_expected):  # An effect of this or of an earlier order.
+        is_settled = reported_at >= self.settles_at  # The modes of all earlier orders must have been reported by now.
+        is_of_earlier_order = number in self._expected_modes and number in self._accepted_modes
+        is_of_this_order = number in self._own_modes
+        if is_change and (is_of_earlier_order or (is_of_this_order and self.was_sent)):
             self.may_move = True
-        if number in self._own_modes:
+        if is_of_this_order:
             self._on_own_mode(is_change=is_change, is_settled=is_settled)
-        elif is_expected and is_settled:
+        elif is_of_earlier_order and is_settled:
             # An earlier order of the program has changed the mode. After this, only another party can change it back.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self.any_mode_until:  # The mode may be the effect of a raw command.
@@ -362,8 +363,8 @@ class SentCommand:
             return "the computer slept"
         return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
 
-    def on_newer_command(self, armed: bool | None) -> None:
-        if armed is not None and self.arms is not None and armed is not self.arms:
+    def on_newer_arm_command(self, armed: bool) -> None:
+        if self.arms is not None and armed is not self.arms:
             self._is_overruled = True
 
     def on_mode(self, mode: Mode, reported_at: float) -> None:

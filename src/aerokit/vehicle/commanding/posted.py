@@ -137,10 +137,7 @@ class PostedOrder:
         """Wait for the next HEARTBEAT. Return False if the order has ended, or if no HEARTBEAT arrives in time."""
         started_at, armed = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(MODE_RETRY_INTERVAL_S)
-        with (
-            ChangeSignal(self._session, armed, every_arrival=True) as changes,
-            anyio.move_on_after(timeout),
-        ):
+        with ChangeSignal(self._session, armed, every_arrival=True) as changes, anyio.move_on_after(timeout):
             while armed.updated_at <= started_at or not self._arbiter.is_state_recent:
                 self._session.end.raise_if_ended()
                 await changes.next(POLL_INTERVAL_S)

@@ -132,6 +132,7 @@ class ChangeSignal:
             detach()
 
     async def next(self, at_most_s: float) -> None:
+        """Wait for the next change, at most ``at_most_s`` seconds."""
         self._changed.clear()
         # No cancel scope is used, because on Python 3.10 an expiring scope swallows a cancellation in the same
         # iteration of the event loop.
@@ -228,17 +229,17 @@ class VehiclePosition:
     def __init__(self, session: VehicleSession) -> None:
         self._telemetry, self._autopilot = session.telemetry, session.autopilot
         # Radius of the circle that the vehicle was ordered to fly; 0 if it was not ordered to circle.
-        self._circle_m = 0.0
-        session.telemetry.mode.observe(lambda *_: self.record_circle(0.0))
+        self._circle_radius_m = 0.0
+        session.telemetry.mode.observe(lambda *_: self.record_circle_radius(0.0))
 
-    def record_circle(self, radius_m: float) -> None:
+    def record_circle_radius(self, radius_m: float) -> None:
         # ArduPlane keeps this radius for further places until it leaves GUIDED.
-        self._circle_m = radius_m
+        self._circle_radius_m = radius_m
 
     @property
     def arrival_radius_m(self) -> float:
         """Distance from the target at which the vehicle counts as arrived."""
-        return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
+        return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_radius_m)
 
     def distance_to(self, target: Position) -> float:
         """Return the distance to ``target`` in metres; infinite while the position is unknown.
@@ -343,7 +344,7 @@ class VehiclePosition:
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, frame
 
-    def as_ordered(self, target: Position) -> Position:
+    def with_sent_altitude(self, target: Position) -> Position:
         """Return the target with the altitude that aerokit sends; see :meth:`global_target`.
 
         PX4 gets an altitude above mean sea level. It keeps this altitude when it later corrects the altitude of home,
@@ -354,11 +355,12 @@ class VehiclePosition:
         altitude_m = self.home_altitude() + target.altitude_relative_m
         return target.replace(altitude_relative_m=None, altitude_amsl_m=altitude_m)
 
-    def as_accepted(self, target: Position) -> Position:
-        """Return a target that the vehicle has just accepted, with its altitude above mean sea level if home is known.
+    def with_amsl_altitude(self, target: Position) -> Position:
+        """Return the target with its altitude above mean sea level, which needs a known home; otherwise unchanged.
 
-        ArduPilot also converts the altitude at this time, and keeps it when home moves later (ArduCopter/
-        mode_guided.cpp, set_destination; GCS_MAVLink_Plane.cpp, handle_command_int_do_reposition).
+        Call this when the vehicle has just accepted the target. ArduPilot also converts the altitude at this time, and
+        keeps it when home moves later (ArduCopter/mode_guided.cpp, set_destination; GCS_MAVLink_Plane.cpp,
+        handle_command_int_do_reposition).
         """
         position, home = self._telemetry.position, self._telemetry.home
         home_m = None if home.latest is None else home.latest.altitude_amsl_m
@@ -369,7 +371,7 @@ class VehiclePosition:
             return target
         return target.replace(altitude_relative_m=None, altitude_amsl_m=home_m + target.altitude_relative_m)
 
-    def command_place(self, target: Position, name: str = "target") -> dict[str, Any]:
+    def command_int_place(self, target: Position, name: str = "target") -> dict[str, Any]:
         """Return the target as arguments of a COMMAND_INT; see :meth:`global_target`."""
         latitude, longitude, altitude, frame = self.global_target(target, name)
         return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}

@@ -10,7 +10,7 @@ import anyio
 from aerokit._internal import geo
 from aerokit.errors import HeartbeatTimeout, OperationRejected, OperationTimeout, SetpointStreamStopped
 from aerokit.mavlink.messages import OrbitExecutionStatus
-from aerokit.vehicle.commanding.closed_paths import PathFlight
+from aerokit.vehicle.commanding.closed_paths import PathSetpoints
 from aerokit.vehicle.commanding.guided import Guided
 from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, StallDetector, await_progress
 
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from aerokit.position import Position
     from aerokit.vehicle.commanding.closed_paths import ClosedPath, LobeCounter, TurnCounter, Vector
     from aerokit.vehicle.commanding.context import VehicleContext
-    from aerokit.vehicle.commanding.guided import SetpointStream
     from aerokit.vehicle.commanding.order import Order
-    from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
 # Seconds between computed set-points, rate in Hz at which the latest one is sent, and seconds for which it stays valid.
 SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
@@ -75,9 +73,9 @@ class RoundFlight:
         # Why the vehicle does not fly the ordered circle, so that `fly_by_command` must order a hold; empty if it does.
         self._circle_problem = ""
         position = context.vehicle_position
-        # The center as arguments of a COMMAND_INT.
-        self._place = position.command_place(center, center_name)
-        self._center = position.as_ordered(center)
+        # The frame, x, y and z of a COMMAND_INT to the center.
+        self._place_fields = position.command_int_place(center, center_name)
+        self._center = position.with_sent_altitude(center)
         position.check_reach(center_name, [center], limits.max_distance_m)
         position.check_flying(operation)
 
@@ -111,14 +109,14 @@ class RoundFlight:
             with cleanup.flying(order):
                 with context.arbiter.changing_mode():
                     send = self._session.commands.send_int
-                    await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
-                self._center = context.vehicle_position.as_accepted(self._center)
+                    await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place_fields)
+                self._center = context.vehicle_position.with_amsl_altitude(self._center)
                 with self._session.streaming("position"):
                     await self._await_rounds(order, mode, stay_s, radius_m)
                 if holds_at_end:
                     await cleanup.stop_in(hold_mode, order)
             if radius_m and not holds_at_end:
-                context.vehicle_position.record_circle(radius_m)
+                context.vehicle_position.record_circle_radius(radius_m)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # also CommandTimeout and HeartbeatTimeout
             # The vehicle may have received the command, so it is ordered to hold.
             cleanup.hold_in_background(order)
@@ -131,6 +129,8 @@ class RoundFlight:
     async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, radius_m: float) -> None:
         session, started = self._session, self._session.connection.now()
         detect_stall, mode_failure = StallDetector(session), self._context.sender.mode_failure(order, mode)
+        # Until this time, PX4 may still report the previous circle, or refuse the new one by a status text.
+        report_due_at = started + CIRCLE_REPORT_S
         wrong_radius = ""  # error text about the last reported radius; empty if it is the ordered one
 
         def on_status(status: OrbitExecutionStatus) -> None:
@@ -144,9 +144,8 @@ class RoundFlight:
         def failure_reason() -> str | None:
             if reason := mode_failure():
                 return reason
-            refusal = self._first_refusal(order.given_at, started + CIRCLE_REPORT_S)
-            # For a moment, PX4 may still report the previous circle.
-            is_radius_reported = session.connection.now() > started + CIRCLE_REPORT_S
+            refusal = self._first_refusal(since=order.given_at, until=report_due_at)
+            is_radius_reported = session.connection.now() > report_due_at
             self._circle_problem = refusal or (wrong_radius if is_radius_reported else "")
             return self._circle_problem or None
 
@@ -209,23 +208,24 @@ class RoundFlight:
     # ------------------------------------------------------------------------------ by set-points
 
     async def fly_by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> None:
-        """Stream the set-points of a path. At the end, the vehicle holds."""
+        """Stream the set-points of a path. The end of the stream, or an error before it, orders the vehicle to hold."""
         try:
             with (
                 self._session.streaming("position", "local_position"),
                 anyio.move_on_after(self._limits.timeout) as scope,
             ):
                 mode = self._context.sender.mode_for(self._operation, "setpoint")
+                # The stream's order is created before the wait for positions, so that a takeover during it is noticed.
                 with self._context.flight_cleanup.preparing_stream(mode) as order:
-                    flight = await self._path_flight(path, speed_m_s, facing)
-                await self._stream(flight, order)
+                    setpoints = await self._path_setpoints(path, speed_m_s, facing)
+                await self._stream_to_end(setpoints, order)
         except SetpointStreamStopped as error:
             error_class = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
             raise error_class(f"{self._operation}: {error}") from error
         if scope.cancelled_caught:
             raise OperationTimeout(f"{self._operation}: not done within {self._limits.timeout:g} s; {self._describe()}")
 
-    async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
+    async def _path_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathSetpoints:
         position, local_position = self._telemetry.position, self._telemetry.local_position
         # The vehicle's position is known in both frames, so the center can be converted from the global to the local
         # one. Both positions must be new: while the vehicle moves, older ones may belong to different places.
@@ -235,9 +235,14 @@ class RoundFlight:
         here = position.fresh(POSITION_MAX_AGE_S)
         north, east = self._offset(here)
         up = self._context.vehicle_position.height_above(here, self._center)
-        local_center = (local.north_m - north, local.east_m - east, local.down_m + up)
-        start, heading = (north, east, -up), self._heading_function(facing)  # `start` is relative to the center
-        return PathFlight(path, self._rounds, speed_m_s, start, local_center, heading)
+        return PathSetpoints(
+            path,
+            self._rounds,
+            speed_m_s,
+            initial_offset=(north, east, -up),
+            center=(local.north_m - north, local.east_m - east, local.down_m + up),
+            heading=self._heading_function(facing),
+        )
 
     def _heading_function(self, facing: str) -> Callable[[Vector, Vector], float | None]:
         initial_deg = self._telemetry.heading_deg.latest
@@ -253,15 +258,16 @@ class RoundFlight:
 
         return heading
 
-    async def _stream(self, flight: PathFlight, order: Order) -> None:
+    async def _stream_to_end(self, setpoints: PathSetpoints, order: Order) -> None:
+        """Stream the set-points until the vehicle has flown all rounds. ``order`` is the stream's steering order."""
         stream = Guided(self._context).trajectory(
-            flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
+            setpoints.advance(seconds=0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
         )
         stream._prepared_order = order
         async with stream:
-            while not flight.is_complete:
-                await self._supply(stream, flight.advance(SETPOINT_INTERVAL_S))
-                if flight.is_on_path:
+            while not setpoints.is_complete:
+                await stream.fly(setpoints.advance(SETPOINT_INTERVAL_S), SETPOINT_INTERVAL_S)
+                if setpoints.is_on_path:
                     self._count_rounds()
             # The vehicle follows the set-point with a delay, so it reaches the end later.
             give_up_at = self._session.connection.now() + END_TIMEOUT_S
@@ -270,8 +276,4 @@ class RoundFlight:
                     raise OperationTimeout(
                         f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
                     )
-                await self._supply(stream, flight.advance(0.0))  # Send the last set-point again.
-
-    async def _supply(self, stream: SetpointStream[TrajectorySetpoint], setpoint: TrajectorySetpoint) -> None:
-        stream.set(setpoint)
-        await anyio.sleep(SETPOINT_INTERVAL_S)
+                await stream.fly(setpoints.advance(seconds=0.0), SETPOINT_INTERVAL_S)  # the last set-point again

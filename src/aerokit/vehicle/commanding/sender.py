@@ -70,7 +70,7 @@ def revoked_acceptance(operation: str, command: int, result: int) -> CommandReje
 
 class AcceptedDisarm(NamedTuple):
     accepted_at: float
-    disarmed_after: float  # Only a HEARTBEAT after this time proves by "disarmed" that the command was executed.
+    effect_reported_after: float  # A HEARTBEAT that reports disarmed shows the effect if it arrives after this time.
 
 
 class OrderSender:
@@ -124,11 +124,11 @@ class OrderSender:
                         await self._session.wait_for_status_texts()
                         raise self._session.with_reasons(error, started) from None
                 except CommandTimeout:
-                    if not sent.is_confirmed:
+                    if not sent.is_confirmed:  # If its effect was reported, only the acknowledgement was lost.
                         raise
         except CommandTimeout as error:
             order.was_sent = was_sent_before or error.was_sent
-            raise self._unanswered(error, order, sent) from None
+            raise self._error_without_answer(error, order, sent) from None
 
     @property
     def _is_taking_off(self) -> bool:
@@ -171,8 +171,8 @@ class OrderSender:
         if not order.only_stops and self._arbiter.slept_since(order.given_at) > 0:
             raise OperationRejected("the computer slept; the rest of the order was not sent")
 
-    def _unanswered(self, error: CommandTimeout, order: Order, sent: SentCommand | None) -> Exception:
-        """Return the error to raise for a command without an answer."""
+    def _error_without_answer(self, error: CommandTimeout, order: Order, sent: SentCommand | None) -> Exception:
+        """Return OperationRejected if a newer order or another party ended the wait for the answer, else ``error``."""
         if order.takeover_reason or (order.failsafe and order.end):  # Another party has ended the order.
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
         # A command to arm is overruled by one to disarm, and the reverse.
@@ -201,25 +201,26 @@ class OrderSender:
         await self.send_arm(order, armed=False, force=force)
         accepted_at = now()
         if not may_be_answer_to_arm:
-            return AcceptedDisarm(accepted_at, started)
+            return AcceptedDisarm(accepted_at, effect_reported_after=started)
         effect_due_at = accepted_at + ARM_HEARTBEAT_DELAY_S
 
-        def disarmed_after() -> float:
+        def effect_reported_after() -> float:
             # Until the arming itself is reported, a HEARTBEAT that reports disarmed may have been sent before it.
-            return started if was_armed or self._arbiter.last_arming_at > started else effect_due_at
+            is_arming_reported = was_armed or self._arbiter.last_arming_at > started
+            return started if is_arming_reported else effect_due_at
 
         is_still_armed = False
         with suppress(OperationTimeout):
             is_still_armed = await armed.wait_until(
-                lambda is_armed: armed.updated_at > (effect_due_at if is_armed else disarmed_after()),
+                lambda is_armed: armed.updated_at > (effect_due_at if is_armed else effect_reported_after()),
                 timeout=min(timeout, DISARM_REPORT_TIMEOUT_S),
             )
         is_current = self._arbiter.is_state_recent and not self._arbiter.slept_since(started)
-        is_newest = self._arbiter.last_arm_command is False
-        if is_still_armed and is_current and is_newest and not order.end:
+        is_last_command_to_disarm = self._arbiter.last_arm_command is False
+        if is_still_armed and is_current and is_last_command_to_disarm and not order.end:
             await self.send_arm(order, armed=False, force=force)
             accepted_at = now()
-        return AcceptedDisarm(accepted_at, disarmed_after())
+        return AcceptedDisarm(accepted_at, effect_reported_after())
 
     def _may_be_answer_to_arm(self) -> bool:
         """Return True if the next answer to a command to disarm may answer an earlier command to arm."""
@@ -280,13 +281,12 @@ class OrderSender:
                 component_id=component_id,
             )
         except CommandRejected as error:
+            # Firmware that does not support the command gets one SET_MODE instead, a message without a component id.
             is_for_autopilot = component_id in (None, BROADCAST, self._session.component_id)
-            if error.result != MavResult.UNSUPPORTED or not is_for_autopilot:  # SET_MODE has no field for a component.
+            if error.result != MavResult.UNSUPPORTED or not is_for_autopilot:
                 raise
             self.raise_if_ended(order)
-            # Firmware that does not support the command gets one SET_MODE instead. While the vehicle is silent, a
-            # takeover may be unreported, so the older message is not sent.
-            if not self._arbiter.is_state_recent:
+            if not self._arbiter.is_state_recent:  # While the vehicle is silent, a takeover may be unreported.
                 raise
             self._session.send(request.legacy(self._session.system_id))
             order.was_refused = False
@@ -301,7 +301,7 @@ class OrderSender:
         *,
         is_over: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Wait until a recent message received after ``reported_since`` reports the mode."""
+        """Wait until a recent message received after ``reported_since`` reports the mode, or ``is_over()`` is true."""
         telemetry = self._session.telemetry
 
         def is_reported() -> bool:
@@ -378,14 +378,14 @@ class OrderSender:
         Possible reasons are a newer order, an impact on the ground, disarming, and a mode that is not one of
         ``modes``. The vehicle has three seconds to report one of the modes.
         """
-        impact = self.impact_failure(order)
+        describe_impact = self.impact_failure(order)
         grace_until = self._session.connection.now() + MODE_GRACE_S
         settles_at = max(order.settles_at, self._arbiter.mode_settles_at)
         was_in_mode = False
 
         def failure_reason() -> str | None:
             nonlocal was_in_mode
-            reason = impact() or order.end
+            reason = describe_impact() or order.end
             if reason:
                 return reason
             if self._session.telemetry.is_confirmed_disarmed:
@@ -398,8 +398,8 @@ class OrderSender:
                 return None
             if was_in_mode:
                 return f"the mode changed to {mode}"
-            has_grace_ended = self._session.connection.now() > grace_until
-            return f"the vehicle stayed in {mode}" if has_grace_ended else None
+            may_still_change = self._session.connection.now() <= grace_until
+            return None if may_still_change else f"the vehicle stayed in {mode}"
 
         return failure_reason
 
@@ -409,7 +409,7 @@ class OrderSender:
 
         def failure_reason() -> str:
             detector.update()
-            order.impact = detector.describe() if order.is_newest else ""
+            order.impact = detector.describe() if order.is_newest else ""  # `FlightCleanup.flying` reads it.
             return order.impact
 
         return failure_reason

@@ -7,7 +7,6 @@ the order documents its arguments, as in ``devices/actuators.py``.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import anyio
@@ -167,7 +166,7 @@ class SimpleOrder(Snapshot):
 
         def failure_reason() -> str | None:
             refusals = [text for text in texts if is_refusal(text)]
-            return f"the vehicle reports {refusals[0]!r}" if refusals else _supersession(order)
+            return f"the vehicle reports {refusals[0]!r}" if refusals else _superseded_reason(order)
 
         try:
             await self.send(context, *values, device_order=order)
@@ -218,12 +217,12 @@ class SimpleOrder(Snapshot):
         detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
         try:
             # A vehicle that refuses requests for the message may still stream it.
-            if await _has_message(context, message_type.ID, target) or latest is not None:
+            if await _accepts_request(context, message_type.ID, target) or latest is not None:
                 await await_progress(
                     session,
                     self.name,
                     is_done=poll_effect,
-                    failure_reason=lambda: _supersession(device_order),
+                    failure_reason=lambda: _superseded_reason(device_order),
                     describe=lambda: f"no {message_type.NAME} was received" if latest is None else str(latest),
                     timeout=timeout,
                 )
@@ -231,19 +230,20 @@ class SimpleOrder(Snapshot):
             detach()
 
 
-def _supersession(order: Order | None) -> str | None:
+def _superseded_reason(order: Order | None) -> str | None:
     return SUPERSEDED if order is not None and not order.is_newest else None
 
 
-async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
+async def _accepts_request(context: VehicleContext, message_id: int, component_id: int) -> bool:
     """Request a message. Returns False if the vehicle refuses."""
-    with suppress(CommandTimeout):  # A vehicle that does not answer may still have the message.
-        try:
-            await context.session.commands.send_long(
-                MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=2, attempt_timeout=1.0
-            )
-        except CommandRejected:
-            return False
+    try:
+        await context.session.commands.send_long(
+            MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=2, attempt_timeout=1.0
+        )
+    except CommandTimeout:  # A vehicle that does not answer may still have the message.
+        return True
+    except CommandRejected:
+        return False
     return True
 
 
@@ -270,6 +270,7 @@ async def receive_once(
     with session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages:
         for _ in range(RECEIVE_ATTEMPTS):
             is_refused = await _is_request_refused(session, message_type.ID, target)
+            # After a refusal, only a message that has already arrived is returned.
             with anyio.move_on_after(0 if is_refused else 0.5):
                 async for message in messages:  # Other components may send this message, too.
                     if message.received_frame is None or message.received_frame.component_id == target:

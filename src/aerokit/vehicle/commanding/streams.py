@@ -174,6 +174,7 @@ class ValueStream(Generic[ValueT]):
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
+        """Stop sending. The next call, or the end of the block, raises ``_stop_error``, which this method sets."""
         self._end()
         is_state_recent = self._context.arbiter.is_state_recent
         hold_text = "a hold was ordered" if is_state_recent else "a hold will be ordered after the next HEARTBEAT"
@@ -191,6 +192,7 @@ class ValueStream(Generic[ValueT]):
         """End the effect of the last value, if the vehicle would otherwise keep executing it."""
 
     def _end(self) -> None:
+        """Stop sending."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -250,7 +252,7 @@ class SteeringStream(ValueStream[ValueT]):
             await self._check_support()
             takeover_check.raise_if_changed(self._NAME)
         except BaseException:
-            self._end()
+            self._end()  # Another stream may be entered from now on.
             raise
         order = self._prepared_order or self._context.arbiter.order(mode)
         self._order = order
@@ -259,7 +261,7 @@ class SteeringStream(ValueStream[ValueT]):
         try:
             await self._enter(mode, order)
         except BaseException as error:
-            self._end()
+            self._end()  # Nothing is sent from now on.
             # After a refusal, the vehicle continues its previous task. After all other errors, it is ordered to hold,
             # unless the order has ended, for example because a pilot took over.
             if not isinstance(error, CommandRejected):
@@ -281,16 +283,15 @@ class SteeringStream(ValueStream[ValueT]):
             raise self._stop_error
 
     async def _leave(self, exc: BaseException | None) -> None:
-        self._end()
+        self._end()  # Nothing is sent from now on, except the hold.
         self._stop_error = SetpointStreamStopped(f"the async with block of this {self._NAME} was left")
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
         elif not self._context.arbiter.is_state_recent:
             # The vehicle is silent, so the report of a takeover may be missing. `_stop` therefore sends the hold in the
-            # background, after the next HEARTBEAT and only if this HEARTBEAT shows no takeover. It also sets
-            # `_stop_error` to an error about the silence.
+            # background, after the next HEARTBEAT and only if this HEARTBEAT shows no takeover.
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
-            raise self._stop_error
+            raise self._stop_error  # `_stop` has set it to an error about the silence.
         elif not self._session.telemetry.is_confirmed_disarmed:
             await self._hold_and_wait()
 
@@ -359,11 +360,13 @@ class TakeoverCheck:
         self._mode_before = telemetry.mode.latest
         self._order_before = context.arbiter.latest(STEERING)
         # True if the vehicle may still change to a mode of `_order_before`, e.g. of the hold after an abandoned flight.
-        is_taken_over = self._order_before is not None and bool(self._order_before.takeover_reason)
-        self._may_change_late = context.arbiter.mode_is_in_doubt and not is_taken_over
-        take_off_mode = autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol)
-        hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
-        self._end_of_take_off = (take_off_mode, hold_mode)
+        was_taken_over = self._order_before is not None and bool(self._order_before.takeover_reason)
+        self._may_change_late = context.arbiter.mode_is_in_doubt and not was_taken_over
+        # The mode change (before, after) by which a take-off ends.
+        self._end_of_take_off = (
+            autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol),
+            autopilot.mode_for("hold", is_vtol=telemetry.is_vtol),
+        )
 
     def raise_if_changed(self, operation: str) -> None:
         """Raise OperationRejected if an order was given, or if the mode was changed."""
@@ -374,7 +377,7 @@ class TakeoverCheck:
         # The end of a take-off, and a change to the mode that the caller wants to order, are not takeovers.
         is_end_of_take_off = (before, mode) == self._end_of_take_off
         order = self._order_before
-        is_late_effect = self._may_change_late and order is not None and mode is not None and order.is_own(mode)
+        is_late_effect = self._may_change_late and order is not None and mode is not None and order.may_cause(mode)
         if is_unchanged or mode == self._next_mode or is_end_of_take_off or is_late_effect:
             return
         raise OperationRejected(f"{operation}: the mode changed from {before} to {mode}; the order was not sent")

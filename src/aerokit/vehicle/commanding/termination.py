@@ -51,7 +51,7 @@ class TerminationActions(VehicleBase):
         """
         # The decorator `checks_arguments` has refused every other intent.
         modes = self.autopilot.modes_of_command(MavCmd.DO_FLIGHTTERMINATION, (TERMINATE,))
-        self._arm_cleanup.stop()
+        self._arm_cleanup.stop_watching()
         order = self._arbiter.order(*modes, ends_flight=True)
         with adding_clause(order, "the flight may have been terminated nevertheless"):
             command = MavCmd.DO_FLIGHTTERMINATION

@@ -51,6 +51,8 @@ POSITION_ONLY = 0x0DF8
 KEEP_THROTTLE = -1
 """param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
 
+USE_PRESENT_POSITION, USE_PLACE = 1, 0  # param1 of DO_SET_HOME
+
 HOME_TOLERANCE_M = 5.0
 """Home counts as moved to a place within this distance; a COMMAND_LONG has a resolution of about two metres."""
 
@@ -116,22 +118,23 @@ class TravelActions(VehicleBase):
             OperationTimeout: the vehicle did not arrive in time, or does not move.
         """
         target = travel_target(target)
-        place = self._position.command_place(target)
-        target = self._position.as_ordered(target)
+        place = self._position.command_int_place(target)
+        target = self._position.with_sent_altitude(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m)
         self._position.check_reach("target", [target], max_distance_m)
         arrival_radius_m = self._position.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
         self._position.check_flying("go_to")
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
+        # The second mode is for firmware that does not support MAV_CMD_DO_REPOSITION; see `_send_target`.
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
         is_incomplete = False  # True once the vehicle has accepted the target, until the speed and the heading are set.
         try:
             with self._flight_cleanup.flying(order):
                 unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
-                if unacknowledged_target is None:  # Otherwise the vehicle converts the altitude at each repetition.
-                    target = self._position.as_accepted(target)
+                if unacknowledged_target is None:  # The vehicle has converted the altitude, and keeps the result.
+                    target = self._position.with_amsl_altitude(target)
                 is_incomplete = True
                 if speed_m_s is not None and not self._speeds_by_reposition:
                     # ArduPilot applies the speed only once the vehicle is on its way.
@@ -355,8 +358,8 @@ class TravelActions(VehicleBase):
         While PX4 is disarmed in the first two minutes after a take-off, it may replace a place by its own position.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
-        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
-        metre.
+        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about two
+        metres.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
@@ -404,14 +407,14 @@ class TravelActions(VehicleBase):
     async def _send_home(self, home_order: Order, place: Position | Home | None) -> None:
         with self._arbiter.auxiliary_order(home_order) as order:
             if place is None:
-                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1 means the present position.
+                await self._sender.send_long(order, MavCmd.DO_SET_HOME, USE_PRESENT_POSITION)
                 return
             # The command takes altitudes above mean sea level only.
             amsl_place = position_with_altitude(place).replace(altitude_relative_m=None)
             latitude, longitude, altitude, _ = self._position.global_target(amsl_place)
             position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
             send = self._session.commands.send_place
-            await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
+            await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, USE_PLACE, **position)
 
     async def _request_home(self) -> None:
         with suppress(AerokitError):
@@ -476,7 +479,7 @@ class LookActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
-        place = self._position.command_place(position_with_altitude(target))
+        place = self._position.command_int_place(position_with_altitude(target))
         if not self._session.commands.is_unsupported(ROI_LOCATION) and await self._set_roi_location(place):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT

@@ -174,9 +174,7 @@ class External:
         latitude, longitude = round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7)
         altitude_mm = round(origin.altitude_amsl_m * 1000)
         time_us = int(session.connection.now() * 1e6)
-        with self._context.arbiter.auxiliary_order() as order:
-            self._context.sender.raise_if_ended(order)
-            session.send(SetGpsGlobalOrigin(session.system_id, latitude, longitude, altitude_mm, time_us))
+        session.send(SetGpsGlobalOrigin(session.system_id, latitude, longitude, altitude_mm, time_us))
         await self._await_origin(origin, timeout)
 
     async def _await_origin(self, origin: Position, timeout: float) -> None:

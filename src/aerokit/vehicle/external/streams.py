@@ -116,10 +116,10 @@ class MeasurementStream(Generic[MeasurementT]):
         self._parameters: dict[str, float] = {}
         # The measurement to send at the end of the period.
         self._waiting: _EncodedMeasurement | None = None
-        # Calls `_flush` at the end of the period, if a measurement waits.
+        # Calls `_send_waiting` at the end of the period, if a measurement waits.
         self._timer: asyncio.TimerHandle | None = None
         # End of the present period. The next measurement is sent at this time at the earliest.
-        self._next_at = -math.inf
+        self._period_ends_at = -math.inf
         self._is_open = False
         self._was_entered = False
         self._sent = 0
@@ -185,20 +185,19 @@ class MeasurementStream(Generic[MeasurementT]):
         messages = self._encode(measurement)
         for message in messages:
             message.encode()  # An invalid value raises here, and not when the timer sends the message.
-        connection = self._session.connection
-        if not connection.is_open:
-            connection.send(messages[0])  # This raises the error that has ended the connection.
-        now = connection.now()
+        self._session.connection.raise_if_ended()
+        now = self._session.connection.now()
         measured_at: float | None = getattr(measurement, "measured_at", None)
         if self._waiting is not None:  # The new measurement replaces the waiting one.
             self._dropped += 1
         self._waiting = _EncodedMeasurement(messages, now if measured_at is None else measured_at)
-        if now >= self._next_at:
-            self._flush()
+        if now >= self._period_ends_at:
+            self._send_waiting()
         elif self._timer is None:
-            self._timer = asyncio.get_running_loop().call_at(self._next_at, self._flush)
+            self._timer = asyncio.get_running_loop().call_at(self._period_ends_at, self._send_waiting)
 
-    def _flush(self) -> None:
+    def _send_waiting(self) -> None:
+        """Send the waiting measurement, unless it is too old or the vehicle is silent, and begin the next period."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -213,8 +212,8 @@ class MeasurementStream(Generic[MeasurementT]):
             return
         # A late transmission does not delay the following periods, so that the average rate is kept. After a pause of
         # more than a period, the periods start again from now.
-        next_period_at = self._next_at + self._period_s
-        self._next_at = next_period_at if next_period_at > now else now + self._period_s
+        next_end = self._period_ends_at + self._period_s
+        self._period_ends_at = next_end if next_end > now else now + self._period_s
         for message in messages:
             session.send(message)
         self._sent += 1

@@ -102,7 +102,7 @@ class RoiMixin(GimbalMixin):
         orders = self._orders
         orders.check_roi()
         target = position_with_altitude(target)
-        place = self._context.vehicle_position.command_place(target)
+        place = self._context.vehicle_position.command_int_place(target)
         order = orders.begin_order()
         aim = AngleTarget(
             lambda: direction_to(self._context, target),

@@ -339,20 +339,22 @@ class CommandSender:
             return  # Otherwise the next command with this MAV_CMD would count as acknowledged, even if it was lost.
         run = self._runs.get(key)
         is_final = ack.result != MavResult.IN_PROGRESS
-        is_answer = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
-        if is_answer and is_final:
+        is_expected = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
+        if is_expected and is_final:
             self._record_result(key, ack)
         if run is not None:
             run.receive(ack)
-        elif is_answer and is_final:
+        elif is_expected and is_final:
             # No call waits for this ack, so it is the ack of an earlier call.
             self._pending_acks[key].pop(0)
             if not self._pending_acks[key]:
                 del self._pending_acks[key]
         elif is_final and ack.result != MavResult.ACCEPTED and key in self._results and self._is_for_our_ids(ack):
-            now = self._connection.now()
-            # Soon after another refusal, this ack may be a copy of it.
-            if now - self._refused_at.get(key, -math.inf) > PENDING_ACK_TIMEOUT_S:
-                self._results[key] = ack.result
-                accepted_at = self._accepted_at.get(key, -math.inf)
-                self._late_refusals[key] = _LateRefusal(accepted_at, now, ack.result)
+            self._on_unexpected_refusal(key, ack.result)
+
+    def _on_unexpected_refusal(self, key: _Key, result: int) -> None:
+        now = self._connection.now()
+        # Soon after another refusal, this ack may be a copy of it.
+        if now - self._refused_at.get(key, -math.inf) > PENDING_ACK_TIMEOUT_S:
+            self._results[key] = result
+            self._late_refusals[key] = _LateRefusal(self._accepted_at.get(key, -math.inf), now, result)

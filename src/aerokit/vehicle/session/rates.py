@@ -196,7 +196,7 @@ class MessageRates:
         while True:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
-                self._watch(stream)
+                self._check_stream(stream)
             # A request that was not answered becomes due again later, and nothing else sets the event then.
             if any(stream.failures for stream in self._streams.values()):
                 self._has_due_streams.set()
@@ -271,7 +271,7 @@ class MessageRates:
     def _mark_refused(self, stream: _Stream, hz: float, reason: str) -> None:
         # `needed_hz` ignores refused rates, so a lower rate is requested next if a caller needs one.
         stream.refused_hz.add(hz)
-        if stream.requested_hz is None or not hz:
+        if stream.requested_hz is None or hz == AUTOPILOT_DEFAULT:
             stream.mark_requested(self._connection.now(), AUTOPILOT_DEFAULT)
         self._publish_unavailable(stream, reason)
 
@@ -282,7 +282,7 @@ class MessageRates:
                 continue
             group = self._group_of_message.get(stream.message_type.ID)
             if group is None:
-                stream.refused_hz.update(stream.requests.values())
+                stream.refused_hz.update(stream.requests.values())  # so that the stream is not due any more
                 self._publish_unavailable(stream, "in no group of REQUEST_DATA_STREAM")
             else:
                 rates_by_group[group] = self._rate_of_group(group)
@@ -315,7 +315,7 @@ class MessageRates:
 
     # ------------------------------------------------------------------------------ watching
 
-    def _watch(self, stream: _Stream) -> None:
+    def _check_stream(self, stream: _Stream) -> None:
         stream.counts_at_checks.append(stream.received)
         if stream.requested_hz is None or stream.requested_hz <= 0:
             return
@@ -333,7 +333,8 @@ class MessageRates:
             self._has_due_streams.set()
 
     def _publish_if_slow(self, stream: _Stream) -> None:
-        if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
+        is_window_full = len(stream.counts_at_checks) > WATCH_WINDOW
+        if stream.requested_hz is None or not is_window_full:
             return
         achieved_hz = stream.achieved_hz()
         if achieved_hz == 0 and stream.is_optional:  # The vehicle may lack an optional message.
@@ -345,13 +346,6 @@ class MessageRates:
         was_slow = stream.is_slow
         stream.is_slow = _is_slow(achieved_hz, stream.requested_hz)
         if stream.is_slow and not was_slow:
-            self._connection.bus.publish(
-                StreamSlow(
-                    self._connection.now(),
-                    self._system_id,
-                    stream.message_type.NAME,
-                    stream.requested_hz,
-                    achieved_hz,
-                    self._component_id,
-                )
-            )
+            now, name = self._connection.now(), stream.message_type.NAME
+            rates = (stream.requested_hz, achieved_hz)
+            self._connection.bus.publish(StreamSlow(now, self._system_id, name, *rates, self._component_id))

@@ -119,19 +119,19 @@ class Transfers:
             try:
                 result = await run_exchange(self.connection, self.system_id, exchange)
             except OperationTimeout as error:
-                self._explain(error)
+                self._append_link_description(error)
                 raise
             finally:
                 detach()
             if isinstance(result, dict):  # A request for several names returns one value or exception for each name.
                 for answer in result.values():
                     if isinstance(answer, OperationTimeout):
-                        self._explain(answer)
+                        self._append_link_description(answer)
             return result
-        self._end.raise_if_ended()
+        self._end.raise_if_ended()  # Only the end of the session cancels `scope`.
         raise AssertionError("the exchange was cancelled, but the session has not ended")
 
-    def _explain(self, error: OperationTimeout) -> None:
+    def _append_link_description(self, error: OperationTimeout) -> None:
         error.args = (f"{error}; {self._describe()}",)
 
     @contextmanager

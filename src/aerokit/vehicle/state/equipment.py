@@ -168,24 +168,24 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
         max_distance_m=message.max_distance / 100,
         quality_percent=quality if quality > INVALID_QUALITY else None,  # 0 means "unknown", 1 "invalid"
     )
-    return _replaced(context.before, sensor, _id_of)
+    return _updated_entries(context.before, sensor, key=_id_of)
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
     """Return all sensors reported so far. Older ArduPilot sends RANGEFINDER, which becomes sensor 0."""
-    return _replaced(
-        context.before, RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN), _id_of
+    return _updated_entries(
+        context.before, RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN), key=_id_of
     )
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
     """Return all receivers reported so far, the first one with the new values of this message."""
-    return _replaced(context.before, _gps_receiver(message, 0), _index_of)
+    return _updated_entries(context.before, _gps_receiver(message, index=0), key=_index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
     """Return all receivers reported so far, the second one with the new values of this message."""
-    return _replaced(context.before, _gps_receiver(message, 1), _index_of)
+    return _updated_entries(context.before, _gps_receiver(message, index=1), key=_index_of)
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
@@ -241,7 +241,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
         time_remaining_s=known(message.time_remaining, unknown=0),
         charge_state=enum_member(MavBatteryChargeState, message.charge_state),
     )
-    return _replaced(context.before, battery, _id_of)
+    return _updated_entries(context.before, battery, key=_id_of)
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
@@ -251,7 +251,7 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
     if voltage is None and remaining is None:
         return None
     battery = Battery(0, voltage, current(message.current_battery, context.autopilot), remaining)
-    return _replaced(context.before, battery, _id_of)
+    return _updated_entries(context.before, battery, key=_id_of)
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
@@ -293,7 +293,7 @@ def vibration(message: messages.Vibration) -> Vibration:
     return Vibration(message.vibration_x, message.vibration_y, message.vibration_z, clippings)
 
 
-def _replaced(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
+def _updated_entries(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
     """Return ``items`` with ``item`` in place of the one with the same key, sorted by key."""
     other_items = (existing for existing in items or () if key(existing) != key(item))
     return tuple(sorted((item, *other_items), key=key))

@@ -206,6 +206,7 @@ class Telemetry(States):
             self._arrived_at = outer_arrived_at
 
     def _handler(self, class_name: str) -> Handler:
+        """Return the function that updates all cells for which messages of this class are a source."""
         special_handlers: Mapping[str, Handler] = {
             "AvailableModes": self._on_available_modes,
             "Statustext": self._on_status_text,
@@ -258,6 +259,7 @@ class Telemetry(States):
         return update_as_fallback if message_source.fallback else chosen_update
 
     def _streamed_message(self, class_name: str, handler: Handler) -> StreamedMessage:
+        """Return an object that keeps the frames of a message until a cell is read, and then calls ``handler``."""
         source, message_class = self._source(class_name), message_type(class_name)
         decode = decoder_of(message_class)
 
@@ -285,7 +287,8 @@ class Telemetry(States):
         if not self._knows_autopilot:
             self._learn_autopilot(heartbeat)
         self._context.base_mode = heartbeat.base_mode
-        if heartbeat.system_status < MavState.CRITICAL <= (self.system_status.latest or MavState.UNINIT):
+        status_before = self.system_status.latest or MavState.UNINIT
+        if heartbeat.system_status < MavState.CRITICAL <= status_before:  # A failsafe has ended.
             self._texts.clear_failsafes()
         return True
 
