@@ -22,7 +22,7 @@ Vector = tuple[float, float]
 """Metres north and east."""
 
 
-class PathPoint(NamedTuple):
+class CurvePoint(NamedTuple):
     """Place relative to the center of a path, and its first and second derivative by the phase."""
 
     place: Vector
@@ -35,7 +35,7 @@ class ClosedPath:
 
     first_phase: float = 0.0
 
-    def at(self, phase: float) -> PathPoint:
+    def at(self, phase: float) -> CurvePoint:
         raise NotImplementedError
 
 
@@ -47,10 +47,10 @@ class Circle(ClosedPath):
         self._direction = 1 if clockwise else -1
         self.first_phase: float = first_phase
 
-    def at(self, phase: float) -> PathPoint:
+    def at(self, phase: float) -> CurvePoint:
         bearing = self.first_phase + self._direction * (phase - self.first_phase)
         north, east = self._radius_m * math.cos(bearing), self._radius_m * math.sin(bearing)
-        return PathPoint((north, east), (-self._direction * east, self._direction * north), (-north, -east))
+        return CurvePoint((north, east), (-self._direction * east, self._direction * north), (-north, -east))
 
 
 class Eight(ClosedPath):
@@ -60,9 +60,9 @@ class Eight(ClosedPath):
         self._major_m, self._axis = major_m, math.radians(axis_deg)
         self._minor_m = minor_m if clockwise else -minor_m
 
-    def at(self, phase: float) -> PathPoint:
+    def at(self, phase: float) -> CurvePoint:
         major_m, minor_m = self._major_m, self._minor_m
-        return PathPoint(
+        return CurvePoint(
             self._to_north_east(major_m * math.sin(phase), -minor_m * math.sin(2 * phase)),
             self._to_north_east(major_m * math.cos(phase), -2 * minor_m * math.cos(2 * phase)),
             self._to_north_east(-major_m * math.sin(phase), 4 * minor_m * math.sin(2 * phase)),
