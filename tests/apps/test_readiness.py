@@ -8,7 +8,7 @@ from flight_harness import in_the_air, open_flight, open_px4
 
 from aerokit.apps.cli.status import _vehicle_lines
 from aerokit.apps.monitor.lines import VehicleText
-from aerokit.apps.readiness import active_failsafe, not_armable, readiness, run_arming_checks
+from aerokit.apps.readiness import active_failsafe, arm_refusals, readiness, run_arming_checks
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavSeverity, MavState
 from aerokit.sim import SimulatedCopter, SimulatedPx4
@@ -27,7 +27,7 @@ async def test_px4_without_gps_groups_reasons_like_status() -> None:
         await run_arming_checks(vehicle)
         found, asked = readiness(vehicle), readiness(vehicle, await vehicle.why_not_armable())
         without_prefix = tuple(vehicle.autopilot.arming_reason(text) or text for text in asked.against_arming)
-        assert found.against_arming == without_prefix == tuple(not_armable(vehicle, vehicle.missing_for_flight()))
+        assert found.against_arming == without_prefix == tuple(arm_refusals(vehicle, vehicle.missing_for_flight()))
         assert found.against_flight == asked.against_flight
         assert POSITION in found.against_flight
         ranks = ["(" in text for text in found.against_arming]

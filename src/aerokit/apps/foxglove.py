@@ -259,10 +259,12 @@ class _TopicChannels:
                 self._send(name, text.at, topics.log_entry(self._to_unix_time(text.at), system_id, text))
 
     def _must_send(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
-        """Return True if a topic has viewers, and its value is newer than the last value sent."""
+        """Return True if a topic has viewers, and its value is newer than the last value sent.
+
+        The first call opens the topic's channel, because the type of the channel depends on the value.
+        """
         channel = self._channels.get(name)
         if channel is None:
-            # The channel cannot be opened earlier, because its type depends on the value.
             channel = self._channels[name] = self._sdk.Channel(
                 name, schema=dict(make_topic().schema), message_encoding="json", context=self.context
             )

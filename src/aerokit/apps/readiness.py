@@ -59,15 +59,15 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
     ``reasons`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against arming are derived from
     the received states. With ``changes_mode``, the present mode is not checked, because `Vehicle.arm` will change it.
     """
-    grouped = _grouped(vehicle, reasons)
+    grouped = _group_reasons(vehicle, reasons)
     if reasons is not None or changes_mode:  # `reasons` includes a refusal because of the mode
         return grouped
     against_arming = dict.fromkeys([*_refused_mode(vehicle), *grouped.against_arming])
     return grouped._replace(against_arming=tuple(against_arming))
 
 
-def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
-    """Like `readiness`, but do not check whether the mode itself allows arming."""
+def _group_reasons(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
+    """Group the reasons into those against arming and those against flight. The mode itself is not checked."""
     missing = vehicle.missing_for_flight()
     against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
     sensors = vehicle.sensors.latest
@@ -75,7 +75,7 @@ def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
     if checks_pass and all(map(_is_about_estimates, against_arming)):
         # Whether missing estimates prevent arming depends on the mode. ArduCopter without a position arms in STABILIZE,
         # but not in GUIDED.
-        refusals = tuple(not_armable(vehicle, missing)) if reasons is None else ()
+        refusals = tuple(arm_refusals(vehicle, missing)) if reasons is None else ()
         all_reasons = dict.fromkeys([*missing, *against_arming])
         return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))
     is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against_arming)
@@ -103,13 +103,13 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     return needed
 
 
-def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
+def arm_refusals(vehicle: Vehicle, missing: list[str]) -> list[str]:
     """Return the known reasons why `Vehicle.arm` would fail. Sends nothing.
 
     ``missing`` is the result of `Vehicle.missing_for_flight`.
     """
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
-        return []
+        return []  # only a connected, disarmed vehicle reports what prevents arming
     autopilot = vehicle.autopilot
     unarmable = unarmable_mode(vehicle)
     if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
@@ -120,11 +120,11 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     mode = vehicle.mode.latest
     current_mode = None if mode is None else mode.name
     arms_in = current_mode if unarmable is None else unarmable["arms_in"]
-    # In modes that need no position, ArduPilot arms without most of these conditions.
-    if arms_in is None or not autopilot.modes_without_position or arms_in in autopilot.modes_without_position:
-        return []
+    # In modes that need no position, ArduPilot arms without most of these conditions. For other firmware, the modes
+    # that need a position are unknown.
+    needs_position = bool(autopilot.modes_without_position) and arms_in not in autopilot.modes_without_position
     estimator = vehicle.estimator.latest
-    if estimator is not None and estimator.missing:
+    if arms_in is not None and needs_position and estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which arming would change the mode"
         headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
         # A value that was not received is not named as a reason, because the vehicle itself may have it.
@@ -192,7 +192,7 @@ class ArmingCheckRequests:
         self._failing: dict[Vehicle, tuple[str, ...]] = {}
         self._requested_at: dict[Vehicle, float] = {}
 
-    def take_due(self, vehicle: Vehicle) -> bool:
+    def claim_if_due(self, vehicle: Vehicle) -> bool:
         """Return True if `run_arming_checks` is due for the vehicle. The checks then count as requested."""
         failing = _failing_checks(vehicle)
         if failing is None:

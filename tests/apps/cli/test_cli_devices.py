@@ -58,7 +58,7 @@ def test_picture_without_address_is_reported_as_not_downloaded(
     options = make_parser("camera").parse_args(["camera", "photo", "--to", str(tmp_path)])
     capture: Any = SimpleNamespace(index=3, place=None, file_url="", success=success, to_dict=dict)
     camera: Any = None  # is not needed, because nothing is downloaded
-    assert asyncio.run(devices._show(options, camera, capture)) is False
+    assert asyncio.run(devices._print_and_download(options, camera, capture)) is False
     assert "not downloaded: its address was not reported" in capsys.readouterr().out
 
 

@@ -357,5 +357,5 @@ def test_missing_extra_names_command_for_this_installation(
 
     monkeypatch.setattr("importlib.metadata.distribution", lambda name: Distribution())
     with pytest.raises(NotInstalled) as caught:
-        import_extra("no_such_module", "monitor")
+        import_extra("no_such_module", extra="monitor")
     assert str(caught.value).endswith(f" -m pip install {requirement}")

@@ -19,7 +19,7 @@ import aerokit
 from aerokit.apps.readiness import readiness
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
-from aerokit.apps.serve.served_vehicles import _thin_out, ground_station_failsafe
+from aerokit.apps.serve.served_vehicles import _thin_out, _TrackPoint, ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
@@ -337,7 +337,7 @@ async def test_track_covers_flight_within_limit(monkeypatch: pytest.MonkeyPatch)
 
 def test_full_track_keeps_marks_of_gaps() -> None:
     here = Position(47.0, 8.0)
-    track = [(here.offset(north_m=index), index in (4, 7)) for index in range(8)]
+    track = [_TrackPoint(here.offset(north_m=index), is_after_gap=index in (4, 7)) for index in range(8)]
     _thin_out(track)
     assert [(round(position.distance_to(here)), is_after_gap) for position, is_after_gap in track] == [
         (0, False),

@@ -20,9 +20,9 @@ from aerokit.logs.report import report_html
 from aerokit.logs.report.charts import (
     COLOURS,
     drawn_track,
-    line,
+    line_trace,
     mode_colours,
-    over_time,
+    timeline,
     timeline_shapes,
     track_parts,
 )
@@ -212,8 +212,8 @@ def test_batteries_have_the_same_names_everywhere(tmp_path: Path) -> None:
 
 def test_series_have_own_colours(tmp_path: Path) -> None:
     flight = flight_of(square(5), tmp_path, changes=3)
-    traces = [line(name, flight.track, "altitude_amsl_m") for name in ("a", "b")]
-    chart = over_time(flight, "name", "m", traces)
+    traces = [line_trace(name, flight.track, "altitude_amsl_m") for name in ("a", "b")]
+    chart = timeline(flight, "name", "m", traces)
     assert chart is not None
     assert [trace["line"]["color"] for trace in chart.traces] == ["colour:series0", "colour:series1"]
 

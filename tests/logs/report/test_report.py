@@ -22,8 +22,8 @@ from aerokit.apps.cli import main
 from aerokit.logs.flights import FlightLog, TimeSeries, failsafes, read_flight
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, ModeChange, Waypoint
 from aerokit.logs.report import report_html
-from aerokit.logs.report.charts import points, rows_to_draw
-from aerokit.logs.report.formatting import clock, length, span
+from aerokit.logs.report.charts import drawn_points, rows_to_draw
+from aerokit.logs.report.formatting import clock_text, distance_text, duration_text
 from aerokit.logs.report.statistics import statistics_of, summary
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFrame
@@ -273,7 +273,7 @@ def test_downsampling_keeps_peaks_and_gaps() -> None:
             i / 10,
             1000.0 if i == 54_321 else -7.0 if i == 77_777 else float("nan") if 30_000 < i < 40_000 else i % 3,
         )
-    times, values = points(columns, "value")
+    times, values = drawn_points(columns, "value")
     assert len(times) <= 2100
     assert values[times.index(5432.1)] == 1000.0
     assert min(value for value in values if value is not None) == -7.0
@@ -285,13 +285,13 @@ def test_downsampling_keeps_peaks_and_gaps() -> None:
 @pytest.mark.parametrize(
     ("result", "expected"),
     [
-        (clock(187.46), "3:07.5"),
-        (clock(59.96), "1:00.0"),
-        (span(47.2), "47 s"),
-        (span(725), "12 min 5 s"),
-        (span(3600 + 180), "1 h 3 min"),
-        (length(9.94), "9.9 m"),
-        (length(3440), "3.4 km"),
+        (clock_text(187.46), "3:07.5"),
+        (clock_text(59.96), "1:00.0"),
+        (duration_text(47.2), "47 s"),
+        (duration_text(725), "12 min 5 s"),
+        (duration_text(3600 + 180), "1 h 3 min"),
+        (distance_text(9.94), "9.9 m"),
+        (distance_text(3440), "3.4 km"),
     ],
 )
 def test_numbers_are_formatted_for_reading(result: str, expected: str) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-from contextlib import suppress
 from typing import TYPE_CHECKING
+
+import anyio
 
 from aerokit.apps.cli.arguments import address, number, port
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, opened
@@ -49,25 +50,25 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="show these MAVLink messages too, unconverted: 'GPS_*' (repeatable)",
     )
-    _add_common(foxglove, 10.0, 100.0, "topic")
+    _add_common(foxglove, rate_of="topic", default_hz=10.0, max_hz=100.0)
     zenoh = _add_publishing(actions, "zenoh", "to a zenoh network")
-    zenoh.set_defaults(module_and_extra=("zenoh", "zenoh"), network_text=str)
+    zenoh.set_defaults(required_module="zenoh", extra="zenoh", printable_network=str)
     zenoh.add_argument(
         "network",
         type=_network,
         metavar="NETWORK",
         help="where to publish: zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
     )
-    _add_common(zenoh, 5.0, 50.0, "state")
+    _add_common(zenoh, rate_of="state", default_hz=5.0, max_hz=50.0)
     mqtt = _add_publishing(actions, "mqtt", "to an MQTT broker")
-    mqtt.set_defaults(module_and_extra=("paho", "mqtt"), network_text=_without_password)
+    mqtt.set_defaults(required_module="paho", extra="mqtt", printable_network=_without_password)
     mqtt.add_argument(
         "network",
         type=_broker,
         metavar="NETWORK",
         help="where to publish: mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …",
     )
-    _add_common(mqtt, 5.0, 50.0, "state")
+    _add_common(mqtt, rate_of="state", default_hz=5.0, max_hz=50.0)
 
 
 def _add_publishing(
@@ -84,17 +85,14 @@ def _add_publishing(
     return action
 
 
-def _add_common(action: argparse.ArgumentParser, default_hz: float, max_hz: float, what: str) -> None:
-    """Add the options that all bridges have.
-
-    ``what`` is the word for a published value in the help texts.
-    """
+def _add_common(action: argparse.ArgumentParser, *, rate_of: str, default_hz: float, max_hz: float) -> None:
+    """Add the options that all bridges have. ``rate_of`` is what ``--rate`` limits: "topic" or "state"."""
     action.add_argument(
         "--rate",
         type=number(0.1, max_hz),
         default=default_hz,
         metavar="HZ",
-        help=f"maximum rate of each {what} (default: {default_hz:g})",
+        help=f"maximum rate of each {rate_of} (default: {default_hz:g})",
     )
     action.add_argument(
         "--listen-only",
@@ -127,7 +125,7 @@ def _without_password(broker: str) -> str:
 
 
 async def _foxglove(options: argparse.Namespace) -> int:
-    import_extra("foxglove", "foxglove")
+    import_extra("foxglove", extra="foxglove")
     from aerokit.apps.foxglove import foxglove_bridge
 
     stop = asyncio.Event()
@@ -154,13 +152,13 @@ def _rates(options: argparse.Namespace) -> dict[type[Message], float] | None:
 
 
 async def _publish(options: argparse.Namespace) -> int:
-    import_extra(*options.module_and_extra)
+    import_extra(options.required_module, extra=options.extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
     from aerokit.vehicle.connect import vehicles_on
 
     stop = asyncio.Event()
-    network = options.network_text(options.network)
+    network = options.printable_network(options.network)
     with on_interrupt(stop.set):
         async with (
             opened(options) as connection,
@@ -172,15 +170,15 @@ async def _publish(options: argparse.Namespace) -> int:
             record = {"network": network, "address": options.address}
             text = f"listening to {options.address}\npublishing to {network}\nuntil Ctrl-C"
             emit(options, "publishing", record, text)
-            published: dict[int, Publishing] = {}
+            publications: dict[int, Publishing] = {}
             while not stop.is_set():
                 connection.raise_if_ended()
                 for system_id, vehicle in vehicles.items():
-                    if system_id not in published:
-                        published[system_id] = Publishing(vehicle, publisher)
-                    published[system_id].publish(connection.now())
-                with suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(stop.wait(), 1 / options.rate)
+                    if system_id not in publications:
+                        publications[system_id] = Publishing(vehicle, publisher)
+                    publications[system_id].publish(connection.now())
+                with anyio.move_on_after(1 / options.rate):
+                    await stop.wait()
     return DONE
 
 

@@ -97,7 +97,12 @@ async def _run(options: argparse.Namespace) -> int:
     if options.sensor == "escs" and not options.propellers_removed:
         raise InvalidArgument("escs: the motors get full throttle; remove the propellers and add --propellers-removed")
     async with connect_to(
-        options, options.address, changes=True, source_system=OBSERVER_SYSTEM_ID, rates={}, signing=signing_of(options)
+        options,
+        options.address,
+        changes_vehicle=True,
+        source_system=OBSERVER_SYSTEM_ID,
+        rates={},
+        signing=signing_of(options),
     ) as vehicle:
         return await _guide(options, _calibration(vehicle, options.sensor))
 

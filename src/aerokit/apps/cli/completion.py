@@ -37,7 +37,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_completion(options: argparse.Namespace) -> int:
-    print(import_extra("argcomplete", "completion").shellcode(["aerokit"], shell=options.shell))
+    print(import_extra("argcomplete", extra="completion").shellcode(["aerokit"], shell=options.shell))
     return DONE
 
 

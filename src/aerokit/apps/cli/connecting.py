@@ -195,7 +195,7 @@ def command_action(
     """
 
     async def run(options: argparse.Namespace) -> int:
-        opening = connected(options, changes=True) if open_target is None else open_target(options)
+        opening = connected(options, changes_vehicle=True) if open_target is None else open_target(options)
         async with opening as target:
             await action(target, options)
         emit_done(options, name.format(**vars(options)), text.format(**vars(options)))
@@ -205,16 +205,16 @@ def command_action(
 
 
 @asynccontextmanager
-async def connected(options: argparse.Namespace, *, changes: bool = False) -> AsyncIterator[Vehicle]:
+async def connected(options: argparse.Namespace, *, changes_vehicle: bool = False) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle that the options name, without requesting message rates.
 
-    ``changes`` means that the command changes something on the vehicle. If several vehicles are on the link, the user
-    must then choose one with ``--system-id``.
+    With ``changes_vehicle``, the command changes something on the vehicle. If several vehicles are on the link, the
+    user must then choose one with ``--system-id``.
     """
     async with connect_to(
         options,
         options.connect,
-        changes=changes,
+        changes_vehicle=changes_vehicle,
         source_system=options.source_system,
         rates={},
         signing=signing_of(options),
@@ -224,11 +224,11 @@ async def connected(options: argparse.Namespace, *, changes: bool = False) -> As
 
 @asynccontextmanager
 async def connect_to(
-    options: argparse.Namespace, link: str | Link, *, changes: bool, **connecting: Any
+    options: argparse.Namespace, link: str | Link, *, changes_vehicle: bool, **connecting: Any
 ) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle on a link, and show a countdown while waiting.
 
-    ``changes`` is as in :func:`connected`. Other arguments are passed to :func:`aerokit.connect`.
+    ``changes_vehicle`` is as in :func:`connected`. Other arguments are passed to :func:`aerokit.connect`.
     """
     from aerokit.vehicle.connect import connect
 
@@ -238,7 +238,7 @@ async def connect_to(
             vehicle = await stack.enter_async_context(
                 connect(link, system_id=options.system_id, timeout=_CONNECT_TIMEOUT_S, baud=options.baud, **connecting)
             )
-        if changes:
+        if changes_vehicle:
             await _check_only_vehicle(vehicle, options)
         yield vehicle
 
@@ -282,7 +282,7 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
                 return
     raise ConnectFailed(
         f"no autopilot heartbeat on {connection.link.address} within {patience_s:g} s:"
-        f" {explain_no_vehicle(connection, None)}{_simulator_hint(connection)}"
+        f" {explain_no_vehicle(connection, wanted_system=None)}{_simulator_hint(connection)}"
     )
 
 

@@ -74,7 +74,7 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
         signing = signing_of(options) if options.connect else None
         is_real = options.connect is not None
         vehicle = await stack.enter_async_context(
-            connect_to(options, address, changes=is_real, record=options.record, signing=signing)
+            connect_to(options, address, changes_vehicle=is_real, record=options.record, signing=signing)
         )
         report = FlightReport(vehicle, options, speedup=1.0 if is_real else options.speedup)
         async with report.running():

@@ -71,15 +71,15 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 @asynccontextmanager
-async def _camera(options: argparse.Namespace, *, changes: bool = True) -> AsyncIterator[Camera]:
-    async with connected(options, changes=changes) as vehicle:
+async def _camera(options: argparse.Namespace, *, changes_vehicle: bool = True) -> AsyncIterator[Camera]:
+    async with connected(options, changes_vehicle=changes_vehicle) as vehicle:
         camera = vehicle.camera if options.camera is None else vehicle.camera_at(options.camera)
         await camera.wait_found(timeout=options.patience)
         yield camera
 
 
 async def _info(options: argparse.Namespace) -> int:
-    async with _camera(options, changes=False) as camera:
+    async with _camera(options, changes_vehicle=False) as camera:
         information = camera.information.value
         name = _printable_text(f"{information.vendor} {information.model}")
         capabilities = ", ".join(sorted(information.capabilities)) or "none reported"
@@ -98,15 +98,15 @@ async def _photo(options: argparse.Namespace) -> int:
         if options.to is not None:
             options.to.mkdir(parents=True, exist_ok=True)
         if options.count == 1:
-            is_complete = await _show(options, camera, await camera.take_photo())
+            is_complete = await _print_and_download(options, camera, await camera.take_photo())
         else:
             async with camera.photo_interval(options.interval, options.count) as captures:
                 async for capture in captures:
-                    is_complete = await _show(options, camera, capture) and is_complete
+                    is_complete = await _print_and_download(options, camera, capture) and is_complete
     return DONE if is_complete else FAILED
 
 
-async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
+async def _print_and_download(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
     """Print a picture's data and, with ``--to``, download it.
 
     Returns False if taking or downloading it failed.
@@ -220,14 +220,14 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
 
 
 @asynccontextmanager
-async def _gimbal(options: argparse.Namespace, *, changes: bool = True) -> AsyncIterator[Gimbal]:
-    async with connected(options, changes=changes) as vehicle:
+async def _gimbal(options: argparse.Namespace, *, changes_vehicle: bool = True) -> AsyncIterator[Gimbal]:
+    async with connected(options, changes_vehicle=changes_vehicle) as vehicle:
         await vehicle.gimbals.discover()  # before gimbals are found, commands go to the autopilot
         yield vehicle.gimbal if options.gimbal is None else vehicle.gimbals.get(options.gimbal)
 
 
 async def _gimbal_info(options: argparse.Namespace) -> int:
-    async with _gimbal(options, changes=False) as gimbal:
+    async with _gimbal(options, changes_vehicle=False) as gimbal:
         try:
             information = await gimbal.information()
         except AerokitError as error:

@@ -152,8 +152,8 @@ class LinkExamination:
         self._duplicate_sources.add((event.system_id, event.component_id))
 
     def findings(self) -> Iterator[Finding]:
-        yield from self._silence()
-        yield from self._ids()
+        yield from self._missing_vehicle()
+        yield from self._ambiguous_ids()
         yield from self._senders()
         yield from self._signing()
         yield from self._undecoded()
@@ -163,11 +163,11 @@ class LinkExamination:
     def is_silent(self) -> bool:
         return not set(self._frames) - {self._own_ids}
 
-    def _silence(self) -> Iterator[Finding]:
+    def _missing_vehicle(self) -> Iterator[Finding]:
         connection = self._connection
         if any(is_autopilot(heartbeat) for heartbeat in connection.heartbeats.values()):
             return
-        text = explain_no_vehicle(connection, None)
+        text = explain_no_vehicle(connection, wanted_system=None)
         total = sum(statistics.bytes for statistics in connection.statistics())
         if set(self._frames) == {self._own_ids}:
             text += "; they seem to be an echo of what this program sends"
@@ -187,7 +187,7 @@ class LinkExamination:
             advice = "check that this port is connected to the autopilot"
         yield Finding("problem", "vehicle", text, advice)
 
-    def _ids(self) -> Iterator[Finding]:
+    def _ambiguous_ids(self) -> Iterator[Finding]:
         ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
         for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
             yield Finding(

@@ -92,7 +92,7 @@ def _destination(options: argparse.Namespace) -> Path:
 
 async def _put(options: argparse.Namespace) -> int:
     size = _size(options.file)
-    async with connected(options, changes=True) as vehicle:
+    async with connected(options, changes_vehicle=True) as vehicle:
         with progress_bar(Path(options.file).name, "B") as on_progress:
             await vehicle.files.upload(
                 options.file, options.path, idle_timeout_s=options.patience, on_progress=on_progress
@@ -139,7 +139,7 @@ async def _get_logs(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         entries = await vehicle.logs.list(idle_timeout_s=options.patience)
         options.to.mkdir(parents=True, exist_ok=True)
-        for entry in _chosen(entries, options):
+        for entry in _selected_logs(entries, options):
             target = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
             # The vehicle counts from 1 again after its logs were erased, so the file may be of another flight.
             if target.exists() and (kept := keep_existing(target)) is not None:
@@ -155,7 +155,7 @@ async def _get_logs(options: argparse.Namespace) -> int:
     return DONE if entries else FAILED
 
 
-def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:
+def _selected_logs(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:
     if options.all:
         return entries
     if not options.ids:
@@ -170,7 +170,7 @@ def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequenc
 async def _erase(options: argparse.Namespace) -> int:
     if await is_declined(options, "logs erase", "erase all flight logs of the vehicle?", "erased"):
         return FAILED
-    async with connected(options, changes=True) as vehicle:
+    async with connected(options, changes_vehicle=True) as vehicle:
         await vehicle.logs.erase(idle_timeout_s=options.patience)
     emit_done(options, "logs erase", "erased")
     return DONE

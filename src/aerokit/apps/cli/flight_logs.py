@@ -11,7 +11,7 @@ from aerokit._internal.formatting import printable
 from aerokit.apps.cli.output import DONE, add_force, add_json, check_not_existing, emit, import_extra
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.logs.flights import check_log_name
-from aerokit.logs.report.formatting import clock
+from aerokit.logs.report.formatting import clock_text
 from aerokit.logs.report.statistics import fall_text
 
 if TYPE_CHECKING:
@@ -46,9 +46,9 @@ async def _convert(options: argparse.Namespace) -> int:
     suffix = options.out.suffix.lower() or f".{options.tables}"
     module = _REQUIRED_MODULES.get(suffix)
     if module is not None:
-        import_extra(module, "convert")
+        import_extra(module, extra="convert")
     if options.log.suffix.lower() == ".ulg":
-        import_extra("pyulog", "convert")
+        import_extra("pyulog", extra="convert")
     from aerokit.logs.convert import convert
 
     check_log_name(options.log)
@@ -97,10 +97,10 @@ def add_report_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def _report(options: argparse.Namespace) -> int:
-    import_extra("plotly", "report")
+    import_extra("plotly", extra="report")
     logs = [options.log] if options.other is None else [options.log, options.other]
     if any(log.suffix.lower() == ".ulg" for log in logs):
-        import_extra("pyulog", "report")
+        import_extra("pyulog", extra="report")
     from aerokit.logs.report import write_report
 
     target = options.output or options.log.with_suffix(".html")
@@ -133,7 +133,7 @@ def _report_text(report: Report) -> str:
             lines.append(f"{letter}:")
         lines += sentences
         for failsafe in failsafes:
-            lines.append(f"{clock(failsafe.time_s)} {failsafe.title}: {failsafe.reaction}")
+            lines.append(f"{clock_text(failsafe.time_s)} {failsafe.title}: {failsafe.reaction}")
             lines += [f"  {fact}" for fact in failsafe.context]
     last_line = f"{report.target}: {report.bytes / 1e6:.1f} MB"
     for falls_of_flight in report.falls:

@@ -266,7 +266,7 @@ async def _connect_and_fly(
             emit(options, "connecting", {"address": address}, f"connecting to {address}")
         signing = None if options.sim else signing_of(options)
         vehicle = await stack.enter_async_context(
-            connect_to(options, link, changes=not options.sim, signing=signing, record=options.record)
+            connect_to(options, link, changes_vehicle=not options.sim, signing=signing, record=options.record)
         )
         report = FlightReport(vehicle, options, speedup=options.speedup if options.sim else 1.0)
         flight = PlanFlight(vehicle, plan, report, interrupts, options)

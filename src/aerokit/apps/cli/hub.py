@@ -39,9 +39,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_names(command, "--read-only", "do not forward messages received there, heartbeats included")
     _add_names(command, "--patient", "if it cannot be opened, start without it and keep trying")
     only = f"send only these messages, to one endpoint or, without @NAME, to each: {_FILTER_EXAMPLE}"
-    _add_filter(command, "--only", _messages, only)
-    _add_filter(command, "--block", _messages, f"do not send these messages: {_FILTER_EXAMPLE}")
-    _add_filter(command, "--rate", _rate, "limit messages to a rate in Hz, for each sender: 'ATTITUDE=5@NAME'")
+    _add_filter(command, "--only", _parse_filter, only)
+    _add_filter(command, "--block", _parse_filter, f"do not send these messages: {_FILTER_EXAMPLE}")
+    _add_filter(command, "--rate", _parse_rates, "limit messages to a rate in Hz, for each sender: 'ATTITUDE=5@NAME'")
     _add_names(command, "--signed", "sign what is sent there, and accept only signed messages")
     add_signing_key(command, f"key for --signed (${SIGNING_KEY_VARIABLE})")
     add_baud(command)
@@ -57,8 +57,8 @@ def _add_names(command: argparse.ArgumentParser, option: str, text: str) -> None
     command.add_argument(option, action="append", default=[], metavar="NAME", help=f"{text} (repeatable)")
 
 
-def _add_filter(command: argparse.ArgumentParser, option: str, read: Callable[[str], object], text: str) -> None:
-    command.add_argument(option, action="append", default=[], type=read, metavar="FILTER", help=f"{text} (repeatable)")
+def _add_filter(command: argparse.ArgumentParser, option: str, parse: Callable[[str], object], text: str) -> None:
+    command.add_argument(option, action="append", default=[], type=parse, metavar="FILTER", help=f"{text} (repeatable)")
 
 
 def _named_address(text: str) -> tuple[str, str]:
@@ -68,7 +68,7 @@ def _named_address(text: str) -> tuple[str, str]:
     return name, address(endpoint_address)
 
 
-def _messages(text: str) -> tuple[str, tuple[str, ...]]:
+def _parse_filter(text: str) -> tuple[str, tuple[str, ...]]:
     """Parse ``MESSAGE,…[@ENDPOINT]`` into the endpoint's name and the patterns of message names.
 
     Without ``@ENDPOINT``, which means all endpoints, the name is "".
@@ -82,9 +82,9 @@ def _messages(text: str) -> tuple[str, tuple[str, ...]]:
     return endpoint, patterns
 
 
-def _rate(text: str) -> tuple[str, dict[str, float]]:
+def _parse_rates(text: str) -> tuple[str, dict[str, float]]:
     """Parse ``MESSAGE=HZ,…[@ENDPOINT]`` into the endpoint ("" for all) and the rate of each message."""
-    endpoint, parts = _messages(text)
+    endpoint, parts = _parse_filter(text)
     rates = {}
     for part in parts:
         name, _, hz = part.partition("=")

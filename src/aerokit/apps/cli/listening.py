@@ -202,7 +202,7 @@ def add_monitor_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_monitor(options: argparse.Namespace) -> int:
-    import_extra("textual", "monitor")
+    import_extra("textual", extra="monitor")
     from aerokit.apps.monitor.app import run_monitor as run_app
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
@@ -225,7 +225,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
             baud=options.baud,
             signing=signing_of(options),
             record=options.record,
-            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, force_exit_later)),
+            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, in_handler=force_exit_later)),
         )
 
 

@@ -163,7 +163,7 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
         if args is not None and not isinstance(self, _TopParser):
-            if self._subparsers is None:
+            if self._subparsers is None:  # otherwise, some of these options belong to an action's own parser
                 self._check_option_names(args)
             if problem := misplaced_address(self, args):
                 self.error(problem)
@@ -301,7 +301,7 @@ def make_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 def complete() -> int:
     try:
-        argcomplete = import_extra("argcomplete", "completion")
+        argcomplete = import_extra("argcomplete", extra="completion")
     except NotInstalled:
         return FAILED
     words = os.environ.get("COMP_LINE", "").split()

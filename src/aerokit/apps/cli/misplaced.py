@@ -49,7 +49,7 @@ def misplaced_file(word: str) -> str | None:
 
 def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> str | None:
     """Return an error text with the right command line if an address is in the wrong place; else None."""
-    words = list(words[: words.index("--")] if "--" in words else words)
+    words = list(words[: words.index("--")] if "--" in words else words)  # after --, every word is a value
     command = parser.prog.split()
     if parser._subparsers is not None:
         return _address_before_action(parser, words) if words and is_address(words[0]) else None

@@ -236,7 +236,7 @@ async def _upload(options: argparse.Namespace) -> int:
     if not any(getattr(plan, part).to_items() for part in PARTS):
         raise InvalidArgument(f"{options.file} has no items; nothing was uploaded")
     _emit_warnings(plan, options)
-    async with connected(options, changes=True) as vehicle:
+    async with connected(options, changes_vehicle=True) as vehicle:
         await upload_parts(vehicle, plan, options)
     return DONE
 
@@ -279,7 +279,7 @@ def _notes(plan: Plan) -> list[str]:
 
 
 async def _clear(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
+    async with connected(options, changes_vehicle=True) as vehicle:
         for part in options.parts:
             await getattr(vehicle, part).clear(idle_timeout_s=options.patience)
             emit_part(options, part, 0, "cleared", f"{part}: cleared")

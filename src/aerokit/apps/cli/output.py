@@ -90,15 +90,16 @@ class _NonblockingStream:
         self.flush()
         return len(text)
 
-    def flush(self, *, waits: bool = False) -> None:
+    def flush(self, *, may_block: bool = False) -> None:
         with suppress(OSError, IndexError):  # IndexError: another thread has just written the last text.
-            while self._unwritten and (waits or can_print(self._stream)):
+            while self._unwritten and (may_block or can_print(self._stream)):
                 self._stream.write(self._unwritten.popleft())
                 self._stream.flush()
 
 
 @contextmanager
 def nonblocking_stderr() -> Iterator[None]:
+    """Within the block, writing to stderr never blocks: a text waits until the terminal accepts it."""
     original = sys.stderr
     if original is None:
         yield
@@ -109,7 +110,7 @@ def nonblocking_stderr() -> Iterator[None]:
         yield
     finally:
         sys.stderr = original
-        stream.flush(waits=True)
+        stream.flush(may_block=True)
 
 
 def _print(text: str) -> None:
@@ -250,8 +251,8 @@ def exit_codes_help() -> str:
     return "Exit codes: " + ", ".join(f"{code} {text}" for code, text in _MEANINGS.items()) + "."
 
 
-def import_extra(module: str, extra: str) -> Any:
-    """Import a module that an extra provides.
+def import_extra(module: str, *, extra: str) -> Any:
+    """Import a module that an optional extra of aerokit provides.
 
     Raises NotInstalled if a package is missing. The text has the command that installs it.
     """

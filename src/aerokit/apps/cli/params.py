@@ -86,11 +86,11 @@ def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     add_metadata(load, checks=True)
 
 
-def connected(options: argparse.Namespace, *, changes: bool = False) -> AbstractAsyncContextManager[Vehicle]:
+def connected(options: argparse.Namespace, *, changes_vehicle: bool = False) -> AbstractAsyncContextManager[Vehicle]:
     # Imported before connecting, because the import would block the event loop.
     import aerokit.vehicle.parameters.parameters  # noqa: F401
 
-    return connecting.connected(options, changes=changes)
+    return connecting.connected(options, changes_vehicle=changes_vehicle)
 
 
 async def _list(options: argparse.Namespace) -> int:
@@ -169,7 +169,7 @@ async def _set(options: argparse.Namespace) -> int:
     metadata = load_metadata_option(options)
     if not options.force:
         check_allowed(metadata, values)  # if --metadata is given, values are checked before connecting
-    async with connected(options, changes=True) as vehicle:
+    async with connected(options, changes_vehicle=True) as vehicle:
         if metadata is None:
             metadata = await metadata_for_check(vehicle, from_file=None, options=options)
             check_allowed(metadata, values)
@@ -191,7 +191,7 @@ async def _load(options: argparse.Namespace) -> int:
 
     file_values = read_parameter_file(options.file)
     file_metadata = load_metadata_option(options)
-    async with connected(options, changes=True) as vehicle:
+    async with connected(options, changes_vehicle=True) as vehicle:
         _check_file(file_values, await _download(vehicle, options), vehicle)
         metadata = await metadata_for_check(vehicle, file_metadata, options)
         if metadata is not None:
@@ -315,7 +315,7 @@ def _emit_results(
         else:
             text = f"{result.name:16} not set: {_with_hint(result.name, result.error, known_names)}"
         emit(options, "parameter_write", _record(result), text)
-        if result.error is not None and code in (DONE, FAILED):
+        if result.error is not None and code in (DONE, FAILED):  # FAILED is less specific than the code of an error
             code = exit_code(result.error)
         elif result.outcome == "clamped" and code == DONE:
             code = FAILED

@@ -65,10 +65,10 @@ def _add_web(command: argparse.ArgumentParser) -> None:
 
 
 async def _run(options: argparse.Namespace) -> int:
-    uvicorn = import_extra("uvicorn", "serve")
-    import_extra("websockets", "serve")
+    uvicorn = import_extra("uvicorn", extra="serve")
+    import_extra("websockets", extra="serve")
     metadata = None if options.metadata is None else load_metadata(options.metadata)
-    serve = import_extra("aerokit.apps.serve", "serve")
+    serve = import_extra("aerokit.apps.serve", extra="serve")
     with new_recording(options.record):
         return await _serve_vehicles(uvicorn, serve, options, metadata)
 
@@ -124,7 +124,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
-    guard = import_extra("aerokit.apps.serve.guard", "serve")
+    guard = import_extra("aerokit.apps.serve.guard", extra="serve")
     return uvicorn.Config(
         app,
         host=host,

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import inspect
 import shlex
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import anyio
 
 from aerokit.apps.cli.arguments import (
     DEFAULT_SIM_ADDRESS,
@@ -236,8 +238,8 @@ async def run_sim(options: argparse.Namespace) -> int:
         async with server, injecting_faults(vehicles, options):
             _emit_addresses(server, options)
             real_duration_s = None if options.duration is None else options.duration / options.speedup
-            with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(stop.wait(), real_duration_s)
+            with anyio.move_on_after(real_duration_s):
+                await stop.wait()
     emit(options, "stopped", {}, "stopped")
     if options.picture is not None:
         from aerokit.testing.picture import save_picture

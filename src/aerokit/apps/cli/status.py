@@ -38,7 +38,7 @@ _REQUESTED = (
     ("batteries", BatteryStatus),
     ("position", GlobalPositionInt),
 )
-# How long to keep the connection open at the end, so that aerokit can restore the stream rates that it has changed.
+# How long to keep the connection open at the end.
 _RESTORE_RATES_S = 0.5
 # How long to wait for a requested message after the vehicle has accepted the request.
 _MESSAGE_TIMEOUT_S = 0.3
@@ -72,16 +72,16 @@ def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
         f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or '(unknown version)'}{type_text}"
         f"{_NO_KEY if lacks_key else ''}",
         f"  mode     {vehicle.mode_name}, {armed}{landed_text}",
-        f"  position {_position(vehicle)}",
-        f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
-        f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
+        f"  position {_position_text(vehicle)}",
+        f"  GPS      {'; '.join(map(_gps_text, vehicle.gps.latest or ())) or _UNKNOWN}",
+        f"  battery  {'; '.join(map(_battery_text, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_vehicle_link_text(vehicle, frame)}",
         *_aligned("failsafe", active_failsafe(vehicle) or ()),
-        *_readiness(vehicle, checks),
+        *_arming_lines(vehicle, checks),
     ]
 
 
-def _readiness(vehicle: Vehicle, checks: Readiness) -> list[str]:
+def _arming_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
     lines = readiness_lines(vehicle, checks)
     if lines and vehicle.armed.latest:  # The words of `lines` are for a disarmed vehicle.
         return _aligned("missing", [*checks.against_arming, *checks.against_flight])
@@ -143,7 +143,7 @@ def _frame_fields(heartbeat: Heartbeat | None) -> dict[str, Any]:
     }
 
 
-def _gps(receiver: GpsReceiver) -> str:
+def _gps_text(receiver: GpsReceiver) -> str:
     has_name = 0 <= receiver.fix_type < len(_FIX_NAMES)
     parts = [_FIX_NAMES[receiver.fix_type] if has_name else f"fix {receiver.fix_type}"]
     if receiver.satellites is not None:
@@ -153,7 +153,7 @@ def _gps(receiver: GpsReceiver) -> str:
     return ", ".join(parts)
 
 
-def _position(vehicle: Vehicle) -> str:
+def _position_text(vehicle: Vehicle) -> str:
     here = vehicle.position.latest
     if here is None:
         return _UNKNOWN
@@ -164,7 +164,7 @@ def _position(vehicle: Vehicle) -> str:
     return f"{here.latitude_deg:.7f}, {here.longitude_deg:.7f}, height above home {height}{old}"
 
 
-def _battery(battery: Battery) -> str:
+def _battery_text(battery: Battery) -> str:
     values = (
         (battery.remaining_percent, ".0f", "%"),
         (battery.voltage_v, ".1f", "V"),
@@ -214,17 +214,17 @@ async def run_status(options: argparse.Namespace) -> int:
         try:
             await await_vehicle(connection, options, options.patience)
         except AerokitError:
-            _emit_components(connection, options, {})
+            _emit_components(connection, options, vehicles={})
             raise
         await anyio.sleep(options.seconds)
         vehicles_found = dict(vehicles)  # a copy, because more vehicles may be found while messages are requested
-        all_checks = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
+        all_checks = await asyncio.gather(*map(_request_readiness, vehicles_found.values()))
         _emit_link(connection, options, connection.now() - started_at)
         for vehicle, checks in zip(vehicles_found.values(), all_checks, strict=True):
             record = _vehicle_record(vehicle, checks)
             emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, checks)))
         _emit_components(connection, options, vehicles_found)
-        await anyio.sleep(_RESTORE_RATES_S)
+        await anyio.sleep(_RESTORE_RATES_S)  # aerokit restores the stream rates that it has changed
     cannot_arm = any(
         checks.against_arming and checks.is_known and not vehicle.is_armed
         for vehicle, checks in zip(vehicles_found.values(), all_checks, strict=True)
@@ -232,7 +232,7 @@ async def run_status(options: argparse.Namespace) -> int:
     return FAILED if cannot_arm else DONE
 
 
-async def _readiness_of(vehicle: Vehicle) -> Readiness:
+async def _request_readiness(vehicle: Vehicle) -> Readiness:
     """Return what a vehicle lacks for arming and for flight, after requesting missing states."""
     # If the vehicle is disarmed, `why_not_armable` requests the estimator's messages.
     needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()

@@ -364,7 +364,7 @@ class FlightReport:
             lines.append(f"next: aerokit report {force}{shlex.quote(recorded_in)}")
         else:
             lines += [frames, "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`"]
-        self._emit("flight_summary", record, "\n".join(lines), waits=True)  # the flight is over, so this may block
+        self._emit("flight_summary", record, "\n".join(lines), may_block=True)  # the flight is over
 
     def _describe_armed(self, speed: float) -> str:
         """Return "armed for 47 s", with notes on an impact and on the speed of a simulation.
@@ -458,10 +458,10 @@ class FlightReport:
         self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
         self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
 
-    def _emit(self, kind: str, record: Mapping[str, object], text: str, *, waits: bool = False) -> None:
+    def _emit(self, kind: str, record: Mapping[str, object], text: str, *, may_block: bool = False) -> None:
         self._unprinted.append((kind, record, text))
         try:
-            while self._unprinted and (waits or can_print()):
+            while self._unprinted and (may_block or can_print()):
                 emit(self._options, *self._unprinted.popleft())
         except OSError:
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - used until the process ends

@@ -95,11 +95,11 @@ def _signals() -> tuple[signal.Signals, ...]:
 
 @contextmanager
 def on_interrupt(
-    callback: Callable[[], None], at_once: Callable[[int], object] = lambda number: None
+    callback: Callable[[], None], in_handler: Callable[[int], object] = lambda number: None
 ) -> Iterator[None]:
     """Within the block, SIGINT, SIGTERM and SIGHUP only call ``callback`` on the running loop.
 
-    The signal handler itself calls ``at_once(number)``, even while the loop is blocked.
+    The signal handler itself calls ``in_handler(signal number)``, even while the loop is blocked.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()
@@ -114,7 +114,7 @@ def on_interrupt(
             if has_hung_up:
                 return
             has_hung_up = True
-        at_once(number)
+        in_handler(number)
         loop.call_soon_threadsafe(callback)
 
     try:

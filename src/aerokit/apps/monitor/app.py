@@ -236,7 +236,7 @@ class Monitor(App[None]):
 
     def _request_arming_checks(self) -> None:
         for vehicle in self._model.vehicles.values():
-            if self._arming_checks.take_due(vehicle):
+            if self._arming_checks.claim_if_due(vehicle):
                 self._commands.start(partial(run_arming_checks, vehicle))
 
     def _has_changed(self, name: str, content: object) -> bool:
@@ -316,7 +316,7 @@ class Monitor(App[None]):
         waited_s = self._model.connection.now() - self._began_at
         return Text(
             f"waiting for a vehicle's heartbeat on {self._name} ({waited_s:.0f} s)\n\n"
-            f"{explain_no_vehicle(self._model.connection, None)}"
+            f"{explain_no_vehicle(self._model.connection, wanted_system=None)}"
         )
 
     def _state_size(self) -> tuple[int, int]:

@@ -63,10 +63,10 @@ class VehicleText:
         is_silent = self._link_state not in (LinkState.CONNECTED, None)
         self._silent_s = vehicle.heartbeat_age if is_silent else 0.0
 
-    def cell(self, cell: StateCell[Any], show: Callable[[Any], str], style: str = "") -> Text:
+    def _text_of(self, cell: StateCell[Any], to_text: Callable[[Any], str], style: str = "") -> Text:
         if not cell.is_known:
             return Text(UNKNOWN, "dim")
-        text = printable(show(cell.value))
+        text = printable(to_text(cell.value))
         # For a silent vehicle, `age_s` is the age that the value had when the silence began.
         age_s = cell.age - self._silent_s
         if age_s > MAX_AGE_S:
@@ -91,18 +91,18 @@ class VehicleText:
 
     def _main_rows(self) -> list[tuple[str, Text]]:
         vehicle = self._vehicle
-        cell = self.cell
+        text_of = self._text_of
         second_row = ("link", self.silence()) if self._silent_s else ("missing", self._missing())
         rows = [
-            ("mode", Text("  ").join([cell(vehicle.mode, _name, "bold"), self._armed()])),
+            ("mode", Text("  ").join([text_of(vehicle.mode, _name, "bold"), self._armed()])),
             second_row,
-            ("attitude", cell(vehicle.attitude, _attitude)),
-            ("altitude", cell(vehicle.position, _altitude)),
-            ("position", cell(vehicle.position, _coordinates)),
-            ("heading", cell(vehicle.heading_deg, _heading)),
+            ("attitude", text_of(vehicle.attitude, _attitude)),
+            ("altitude", text_of(vehicle.position, _altitude)),
+            ("position", text_of(vehicle.position, _coordinates)),
+            ("heading", text_of(vehicle.heading_deg, _heading)),
             ("speed", self._speeds()),
-            ("battery", cell(vehicle.batteries, lambda batteries: " · ".join(map(_battery, batteries)))),
-            ("GPS", cell(vehicle.gps, lambda receivers: " · ".join(map(_gps, receivers)))),
+            ("battery", text_of(vehicle.batteries, lambda batteries: " · ".join(map(_battery, batteries)))),
+            ("GPS", text_of(vehicle.gps, lambda receivers: " · ".join(map(_gps, receivers)))),
         ]
         if not self._silent_s:
             rows.append(("link", self._link()))
@@ -110,33 +110,36 @@ class VehicleText:
 
     def _more_rows(self) -> list[tuple[str, Text]]:
         vehicle = self._vehicle
-        cell = self.cell
+        text_of = self._text_of
         return [
             ("home", self._home()),
-            ("mission", cell(vehicle.mission_current, _mission)),
-            ("airspeed", cell(vehicle.air_speed_m_s, _speed)),
-            ("throttle", cell(vehicle.throttle_percent, lambda percent: number(percent, 0, " %"))),
-            ("wind", cell(vehicle.wind, lambda wind: f"{number(wind.speed_m_s)} m/s from {wind.direction_deg:.0f}°")),
-            ("version", cell_of_constant(vehicle.version)),
+            ("mission", text_of(vehicle.mission_current, _mission)),
+            ("airspeed", text_of(vehicle.air_speed_m_s, _speed)),
+            ("throttle", text_of(vehicle.throttle_percent, lambda percent: number(percent, 0, " %"))),
+            (
+                "wind",
+                text_of(vehicle.wind, lambda wind: f"{number(wind.speed_m_s)} m/s from {wind.direction_deg:.0f}°"),
+            ),
+            ("version", _text_of_constant(vehicle.version)),
         ]
 
     def list_row(self, *, is_selected: bool, more: bool) -> Text:
         vehicle = self._vehicle
-        cell = self.cell
+        text_of = self._text_of
         text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
         text.append(f"{vehicle.system_id:>3} ", "bold")
         columns = [
             (10, Text(vehicle.autopilot.name)),
-            (12, cell(vehicle.mode, _name)),
+            (12, text_of(vehicle.mode, _name)),
             (9, self._armed()),
-            (9, cell(vehicle.position, lambda position: number(position.altitude_relative_m, 1, " m"))),
-            (6, cell(vehicle.batteries, lambda batteries: number(batteries[0].remaining_percent, 0, " %"))),
+            (9, text_of(vehicle.position, lambda position: number(position.altitude_relative_m, 1, " m"))),
+            (6, text_of(vehicle.batteries, lambda batteries: number(batteries[0].remaining_percent, 0, " %"))),
         ]
         if more:
             columns += [
-                (10, cell(vehicle.ground_speed_m_s, _speed)),
-                (6, cell(vehicle.heading_deg, _heading)),
-                (40, cell(vehicle.gps, lambda receivers: _gps(receivers[0]))),
+                (10, text_of(vehicle.ground_speed_m_s, _speed)),
+                (6, text_of(vehicle.heading_deg, _heading)),
+                (40, text_of(vehicle.gps, lambda receivers: _gps(receivers[0]))),
             ]
         if not self._silent_s and more:
             columns.append((0, self._missing() if self._reasons() else self._ready()))
@@ -156,14 +159,14 @@ class VehicleText:
 
     def _armed(self) -> Text:
         style = DANGER if self._vehicle.armed.latest else ""
-        return self.cell(self._vehicle.armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style)
+        return self._text_of(self._vehicle.armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style)
 
     def _ready(self) -> Text:
         return Text("armed" if self._vehicle.armed.latest else "ready")
 
     def _speeds(self) -> Text:
-        ground_speed = self.cell(self._vehicle.ground_speed_m_s, _speed)
-        climb = self.cell(self._vehicle.climb_m_s, _climb)
+        ground_speed = self._text_of(self._vehicle.ground_speed_m_s, _speed)
+        climb = self._text_of(self._vehicle.climb_m_s, _climb)
         return Text.assemble(ground_speed, "  climb ", climb)
 
     def _home(self) -> Text:
@@ -179,9 +182,9 @@ class VehicleText:
         quality = self._vehicle.link_quality
         state = self._link_state
         text = Text() if state is None else Text(f"{state.value}  ", LINK_STYLES[state])
-        text.append("loss ").append_text(self.cell(quality, lambda report: number(report.loss_percent, 1, " %")))
+        text.append("loss ").append_text(self._text_of(quality, lambda report: number(report.loss_percent, 1, " %")))
         text.append("  round trip ")
-        return text.append_text(self.cell(quality, lambda report: _milliseconds(report.round_trip_s)))
+        return text.append_text(self._text_of(quality, lambda report: _milliseconds(report.round_trip_s)))
 
     def all_missing(self) -> str:
         """Return one line for each reason that prevents a flight, or "Nothing is missing."."""
@@ -227,7 +230,7 @@ def _with_count(reasons: Sequence[str], shown: int) -> list[str]:
     return [*texts[:-1], f"{texts[-1]} (and {more} more)"] if more else texts
 
 
-def cell_of_constant(cell: StateCell[Any]) -> Text:
+def _text_of_constant(cell: StateCell[Any]) -> Text:
     """Return the text of a value that does not become old, such as a version."""
     return Text(printable(str(cell.value))) if cell.is_known else Text(UNKNOWN, "dim")
 

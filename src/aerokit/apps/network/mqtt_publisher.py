@@ -8,6 +8,8 @@ import ssl
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
+import anyio
+
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
 from aerokit._internal.values import Snapshot
@@ -115,7 +117,7 @@ class MqttLink(BaseLink):
         self._unsent: dict[str, bytes] = {}
         self._client: Any = None
         self._timer: asyncio.TimerHandle | None = None
-        self._connect_result: asyncio.Future[str] | None = None  # the reason of a failure; "" for success
+        self._connect_result: asyncio.Future[str] | None = None  # why the broker refuses; "" for success
         self._is_accepted = False  # True when the broker has accepted the connection
         self._alive_topic = broker.key_space.root + "/alive"
 
@@ -167,12 +169,9 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
-        # asyncio.wait_for is not used, because it could lose a cancellation before Python 3.12.
-        await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
-        if self._connect_result.done():
-            refusal = self._connect_result.result()
-        else:
-            refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it an MQTT broker?)"
+        refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it an MQTT broker?)"
+        with anyio.move_on_after(CONNECT_TIMEOUT_S):
+            refusal = await self._connect_result
         if not refusal and client.socket() is None:
             refusal = "the broker closed the connection"
         if refusal:
@@ -250,10 +249,10 @@ class MqttLink(BaseLink):
 
 
 def _close_socket(client: Any) -> None:
-    # Without DISCONNECT, the broker publishes "offline" itself (will_set).
+    """Close the socket, and discard what is not sent. Without DISCONNECT, the broker itself publishes "offline"."""
     sock = client.socket()
     if sock is not None:
-        if client.on_socket_close is not None:
+        if client.on_socket_close is not None:  # paho calls it only if paho itself closes the socket
             client.on_socket_close(client, None, sock)
             client.on_socket_close = None
         discard_on_close(sock)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import anyio
 from starlette.responses import Response
 
 from aerokit import __version__
@@ -17,7 +18,6 @@ from aerokit.apps.serve.orders import (
     ORDERS,
     SET_PARAMETER,
     UPLOAD,
-    OrderRecord,
     OrderRunner,
     OrderType,
     check_parameter,
@@ -393,7 +393,7 @@ class HttpApi:
     async def _plan(self, request: Request, kind: str) -> tuple[Any, float]:
         """Return the mission, fence or rally points of a vehicle, and their age in seconds."""
         vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)
-        async with self._lock(vehicle):
+        async with self._transfer_lock(vehicle):
             download = self._downloads.get((vehicle, kind))
             control = getattr(vehicle, kind)
             count = vehicle.mission.count.latest if kind == "mission" else None
@@ -430,7 +430,7 @@ class HttpApi:
         is_refresh = self._is_refresh(request)
         # A recording needs PARAM_VALUE messages, because reports do not read parameters from MAVFTP.
         is_recorded = vehicle.connection._observers.recording is not None
-        async with self._lock(vehicle):
+        async with self._transfer_lock(vehicle):
             table = await vehicle.parameters.download(method="list" if is_recorded else "auto", refresh=is_refresh)
         metadata = self._metadata_of(vehicle)
         return json_response({"parameters": [_parameter(table[name], metadata) for name in sorted(table)]})
@@ -463,7 +463,8 @@ class HttpApi:
             order_type = parameter_order(metadata)
         key = request.headers.get("idempotency-key", "").strip().strip('"')
         record = self._orders.submit(vehicle, order_type, arguments, key, seen_at(request))
-        await _wait_until_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
+        with anyio.move_on_after(None if waits else _REFUSAL_TIMEOUT_S):
+            await record.ended.wait()
         if record.problem is not None:
             return json_response(
                 {**record.problem, "order": record.to_dict()}, record.problem["status"], "application/problem+json"
@@ -482,7 +483,7 @@ class HttpApi:
             self._access.check(request.headers, needs_token=True)
         return is_refresh
 
-    def _lock(self, vehicle: Vehicle) -> asyncio.Lock:
+    def _transfer_lock(self, vehicle: Vehicle) -> asyncio.Lock:
         # With this lock, a request waits for a running transfer of the vehicle, and then uses its result.
         return self._locks.setdefault(vehicle, asyncio.Lock())
 
@@ -504,15 +505,6 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
     fields |= {"default": to_jsonable(default), "meaning": entry.describe(parameter.value)}
     fields |= {"values": {str(value): text for value, text in entry.values.items()}, "has_bits": bool(entry.bitmask)}
     return fields
-
-
-async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
-    # asyncio.wait_for is not used, because it could lose a cancellation before Python 3.12.
-    waiting = asyncio.ensure_future(record.ended.wait())
-    try:
-        await asyncio.wait((waiting,), timeout=timeout_s)
-    finally:
-        waiting.cancel()
 
 
 def _summary(vehicle: Vehicle) -> dict[str, Any]:

@@ -67,11 +67,11 @@ class FlightWatch:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
-        self._reset()
+        self._restart_detection()
         # The last descent at IMPACT_M_S or faster.
         self._last_sink_at = -math.inf
         self._last_sink_m_s = 0.0
-        self._was_sudden_stop = False  # whether the last impact was one
+        self._was_sudden_stop = False  # True if the vehicle stopped suddenly at the last impact
         self._armed_at: float | None = None  # None if the time of arming is unknown
         self._disarmed_at = -math.inf
         self._was_in_air = False  # True if the vehicle was in the air since the last arming
@@ -96,7 +96,7 @@ class FlightWatch:
         self._moving_since = math.inf
         self._take_off_altitude_m: float | None = None
 
-    def _reset(self) -> None:
+    def _restart_detection(self) -> None:
         self._forget_impact()
         self._detector = ImpactDetector(self._vehicle.telemetry)
 
@@ -156,7 +156,7 @@ class FlightWatch:
             self._armed_at = now if before is False else None
             self._was_in_air = self._vehicle.landed_state.latest in _IN_AIR
             self._disarming = None
-            self._reset()
+            self._restart_detection()
         elif before:
             self._disarmed_at = now
             was_ordered = now - self._disarm_ordered_at <= DISARM_ORDER_MAX_AGE_S
@@ -177,27 +177,31 @@ class FlightWatch:
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
         at = self._vehicle.velocity.updated_at
-        down_m_s = velocity.down_m_s
-        self._detector.update()
-        if down_m_s >= IMPACT_M_S:  # While the vehicle sinks fast, only the sink rate and its time are stored.
-            self._last_sink_at = at
-            self._last_sink_m_s = down_m_s
-        elif not self._detector.describe():
-            self._forget_impact()
-        # An impact begins when a fast descent ends suddenly. A vehicle that falls again, for example out of a tree, has
-        # a second impact. After a crash, no further impact is detected.
-        elif self._crash is None and (self._impact_at is None or self._impact_at < self._last_sink_at):
-            self._start_impact(at, down_m_s)
+        self._update_impact(at, velocity.down_m_s)
         if self._impact_at is None or self._is_impact_dismissed:
             return
-        ground_speed_m_s, vertical_speed_m_s = velocity.ground_speed_m_s, abs(down_m_s)
+        ground_speed_m_s, vertical_speed_m_s = velocity.ground_speed_m_s, abs(velocity.down_m_s)
         is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
         if self._crash is None:
             self._check_crashed(at, self._impact_at, is_still=is_still)
         else:
-            self._check_flies_again(
-                at, is_still=is_still, is_fast=max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
-            )
+            is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
+            self._check_flies_again(at, is_still=is_still, is_fast=is_fast)
+
+    def _update_impact(self, at: float, down_m_s: float) -> None:
+        """Start an impact when a fast descent ends suddenly. Forget it if the vehicle did not hit the ground."""
+        self._detector.update()
+        if down_m_s >= IMPACT_M_S:
+            self._last_sink_at = at
+            self._last_sink_m_s = down_m_s
+            return
+        has_hit_ground = bool(self._detector.describe())
+        # A vehicle that falls again, for example out of a tree, has a second impact.
+        is_new_impact = self._impact_at is None or self._impact_at < self._last_sink_at
+        if not has_hit_ground:
+            self._forget_impact()
+        elif is_new_impact and self._crash is None:  # after a crash, no further impact is detected
+            self._start_impact(at, down_m_s)
 
     def _start_impact(self, at: float, down_m_s: float) -> None:
         self._forget_impact()

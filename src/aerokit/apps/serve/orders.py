@@ -358,7 +358,7 @@ class OrderRunner:
                 "an order with this Idempotency-Key has ended, and its result is no longer stored; nothing was sent"
                 " now: check the state of the vehicle before you give an order with a new key",
             )
-        self._check(vehicle, order_type, parsed.recorded, seen_at_s)
+        self._check_allowed(vehicle, order_type, parsed.recorded, seen_at_s)
         unix_s = vehicle.connection.unix_time()
         record = OrderRecord(key, vehicle.system_id, order_type.name, parsed.recorded, unix_s)
         run = partial(self._run, vehicle, order_type, record, parsed.passed)
@@ -384,7 +384,7 @@ class OrderRunner:
         """Cancel running orders. Their vehicles hold, as after every cancelled action."""
         await self._background.aclose()
 
-    def _check(
+    def _check_allowed(
         self, vehicle: Vehicle, order_type: OrderType, arguments: Mapping[str, Any], seen_at_s: float | None
     ) -> None:
         vehicle.connection.raise_if_ended()

@@ -10,12 +10,12 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import anyio
 
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.readiness import ArmingCheckRequests, active_failsafe, not_armable, run_arming_checks, unarmable_mode
+from aerokit.apps.readiness import ArmingCheckRequests, active_failsafe, arm_refusals, run_arming_checks, unarmable_mode
 from aerokit.apps.serve.flight_watch import FlightWatch
 from aerokit.apps.serve.requests import HttpProblem
 from aerokit.autopilots.failsafes import gcs_failsafe
@@ -49,6 +49,11 @@ MIN_TRACK_STEP_M = 0.5
 TRACK_GAP_S = 3.0
 
 
+class _TrackPoint(NamedTuple):
+    position: Position
+    is_after_gap: bool
+
+
 class ServedVehicles:
     """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
 
@@ -62,7 +67,7 @@ class ServedVehicles:
     def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:
         self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
         self._texts: dict[int, deque[dict[str, Any]]] = {}
-        self._tracks: dict[int, list[tuple[Position, bool]]] = {}  # True marks the first position after a gap
+        self._tracks: dict[int, list[_TrackPoint]] = {}
         self._arming_checks = ArmingCheckRequests()
         self._watches: dict[Vehicle, FlightWatch] = {}
         self._listeners: list[Listener] = []
@@ -107,7 +112,7 @@ class ServedVehicles:
         # A vehicle may have moved if it is silent, or reports no velocity.
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
         is_observed = is_connected and vehicle.velocity.age <= VELOCITY_MAX_AGE_S
-        return self._watch(vehicle).crash if is_observed else None
+        return self._flight_watch(vehicle).crash if is_observed else None
 
     def texts(self, system_id: int) -> list[dict[str, Any]]:
         return list(self._texts.get(system_id, ()))
@@ -115,7 +120,7 @@ class ServedVehicles:
     def track(self, system_id: int) -> list[tuple[float, float, bool]]:
         """Return a vehicle's track as (latitude, longitude, is after a gap), the oldest position first."""
         points = self._tracks.get(system_id, ())
-        return [(position.latitude_deg, position.longitude_deg, is_after_gap) for position, is_after_gap in points]
+        return [(point.position.latitude_deg, point.position.longitude_deg, point.is_after_gap) for point in points]
 
     def snapshot(self) -> str:
         """Return the stream's message ``state`` as JSON. It is at most `SNAPSHOT_MAX_AGE_S` old."""
@@ -150,7 +155,7 @@ class ServedVehicles:
         self._watches.clear()
         await self._background.aclose()
 
-    def _watch(self, vehicle: Vehicle) -> FlightWatch:
+    def _flight_watch(self, vehicle: Vehicle) -> FlightWatch:
         if vehicle not in self._watches:
             self._watches[vehicle] = FlightWatch(vehicle)
             self._background.start(partial(_read_return_altitude, vehicle), "aerokit serve altitude")
@@ -158,12 +163,12 @@ class ServedVehicles:
 
     def _on_message(self, message: Mapping[str, Any]) -> None:
         if message["type"] == "order" and (vehicle := self._vehicles.get(message["system_id"])) is not None:
-            self._watch(vehicle).on_order(message["order"])
+            self._flight_watch(vehicle).on_order(message["order"])
 
     async def _follow_connection(self, connection: Connection) -> None:
         async with vehicles_on(connection) as vehicles:
             self._vehicles = vehicles
-            await asyncio.Event().wait()
+            await anyio.sleep_forever()
 
     def _attach_new_connections(self) -> None:
         for vehicle in self._vehicles.values():
@@ -189,46 +194,44 @@ class ServedVehicles:
         interrupted: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
-                self._watch(vehicle)  # begins to watch a new vehicle
+                self._flight_watch(vehicle)  # starts to watch a new vehicle
                 position = vehicle.position.latest
                 if position is None or vehicle.position.age > TRACK_GAP_S:
                     interrupted.add(system_id)
                     continue
                 track = self._tracks.setdefault(system_id, [])
-                if track:
-                    last_position, _ = track[-1]
-                    if last_position.distance_to(position) < MIN_TRACK_STEP_M:
-                        continue
+                if track and track[-1].position.distance_to(position) < MIN_TRACK_STEP_M:
+                    continue
                 if len(track) >= MAX_TRACK_POINTS:
                     _thin_out(track)
-                track.append((position, system_id in interrupted))
+                track.append(_TrackPoint(position, is_after_gap=system_id in interrupted))
                 interrupted.discard(system_id)
             await anyio.sleep(TRACK_INTERVAL_S)
 
     async def _request_arming_checks(self) -> None:
         while True:
             for vehicle in tuple(self._vehicles.values()):
-                if self._arming_checks.take_due(vehicle):
+                if self._arming_checks.claim_if_due(vehicle):
                     self._background.start(partial(run_arming_checks, vehicle), "aerokit serve check")
             await anyio.sleep(TRACK_INTERVAL_S)
 
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
-        watch = self._watch(vehicle)
+        watch = self._flight_watch(vehicle)
         missing = vehicle.missing_for_flight()
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
-        unread = []
+        unread_parameters = []
         if watch.disarm_parameter is not None and watch.disarm_delay_s is None:
-            unread.append(watch.disarm_parameter)
+            unread_parameters.append(watch.disarm_parameter)
         return {
             **overview(vehicle),
             "missing_for_flight": missing,
-            "not_armable": not_armable(vehicle, missing),
+            "not_armable": arm_refusals(vehicle, missing),
             # `self.crash` is None for a silent vehicle, because it may have moved. The page shows its last known crash.
             "crash": self.crash(vehicle) if is_connected else watch.crash,
             "disarming": watch.disarming,
             "disarm_parameter": watch.disarm_parameter,
             "disarm_delay_s": watch.disarm_delay_s,
-            "unread": unread,
+            "unread": unread_parameters,
             "return_altitude_m": known_return_altitude(vehicle.parameters, vehicle.autopilot, is_vtol=vehicle.is_vtol),
             "failsafe": ground_station_failsafe(vehicle),
             "active_failsafe": active_failsafe(vehicle),
@@ -248,11 +251,14 @@ def _log_unexpected(error: Exception) -> None:
         logger.error("a task of aerokit serve has failed", exc_info=error)
 
 
-def _thin_out(track: list[tuple[Position, bool]]) -> None:
+def _thin_out(track: list[_TrackPoint]) -> None:
     """Remove every second point of a full track. The first and the last point stay."""
-    pairs = zip(track[2::2], track[3::2], strict=False)
+    removed_and_kept = zip(track[2::2], track[3::2], strict=False)
     # If the first point after a gap is removed, the next point is marked instead.
-    track[2:] = [(position, is_after_gap or removed[1]) for removed, (position, is_after_gap) in pairs]
+    track[2:] = [
+        _TrackPoint(kept.position, is_after_gap=kept.is_after_gap or removed.is_after_gap)
+        for removed, kept in removed_and_kept
+    ]
 
 
 async def _read_return_altitude(vehicle: Vehicle) -> None:

@@ -106,8 +106,8 @@ class StateStream:
             code = 1011  # "internal error"
         else:
             return
-        with suppress(Exception):  # the client may have disconnected
-            await asyncio.wait_for(socket.close(code), 1.0)
+        with suppress(Exception), anyio.move_on_after(1.0):  # the client may have disconnected
+            await socket.close(code)
 
     async def _send_messages(self, socket: WebSocket, period_s: float) -> None:
         loop = asyncio.get_running_loop()
@@ -138,11 +138,8 @@ class StateStream:
                         missed = 0
                     await _send(socket, json.dumps(message, ensure_ascii=False))
                 changed.clear()
-                timer = loop.call_later(max(0.001, next_snapshot_at - loop.time()), changed.set)
-                try:
+                with anyio.move_on_after(next_snapshot_at - loop.time()):
                     await changed.wait()
-                finally:
-                    timer.cancel()
         finally:
             stop_listening()
 

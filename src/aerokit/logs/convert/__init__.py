@@ -121,11 +121,11 @@ def convert(
             incomplete.mkdir()
         log_reader = LOG_READERS[source.suffix.lower()](source)
         writer = make_writer(incomplete, log_reader)
-        entries, begins_at, ends_at, written = _write_records(log_reader, writer, on_bytes)
+        entries, begins_at, ends_at = _write_records(log_reader, writer, on_bytes)
         size = _move(incomplete, target_path)
     notes = tuple(log_reader.notes)
     return Conversion(
-        target_path, entries, written=written, bytes=size, begins_at=begins_at, ends_at=ends_at, notes=notes
+        target_path, entries, written=writer.written, bytes=size, begins_at=begins_at, ends_at=ends_at, notes=notes
     )
 
 
@@ -140,8 +140,8 @@ def _writer_for(target: Path, table_format: str) -> Callable[[Path, LogReader], 
     return writer
 
 
-def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
-    """Write all records. Return their number, the first and the latest time, and ``writer.written``."""
+def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float]:
+    """Write all records. Return their number, and the first and the latest time."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):
@@ -155,7 +155,7 @@ def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], ob
     except BaseException:
         writer.discard()
         raise
-    return entries, begins_at, ends_at, writer.written
+    return entries, begins_at, ends_at
 
 
 def _move(complete: Path, target: Path) -> int:

@@ -111,6 +111,8 @@ class _Reader:
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight.system_id)
+        self._damaged = 0  # number of skipped records
+        self._doubtful_unix_s = math.inf  # time of the last record that was skipped because of _DOUBTFUL_JUMP_S
         # Commands that the vehicle itself has sent are ignored, because they are for its own components. For
         # example, PX4 informs its components when it has decided to return.
         commands: dict[type[Message], Callable[[float, Any], None]] = {
@@ -135,14 +137,13 @@ class _Reader:
         # of the header are read.
         flight, source, link = self._flight, self._source, self._link
         handlers_of_vehicle, handlers_of_other_senders = self._handlers_of_vehicle, self._handlers_of_other_senders
-        records, damaged = 0, 0
+        records = 0
         begins_at, ends_at = 0.0, 0.0
         new_frames = 0  # the vehicle's frames since the last call of link.count()
         next_second_unix_s, expected_sequence = 0.0, -1
         last_frame_at = math.nan  # time of the record with the vehicle's last frame
         previous_unix_s = math.nan
         paused_s = 0.0  # seconds without any record since the vehicle's last frame
-        doubtful_unix_s = math.inf  # time of the last record that was skipped because of _DOUBTFUL_JUMP_S
         set_back_s = 0.0  # sum of the jumps by which the recording's clock was set back
         with flight.path.open("rb") as file:
             for recorded_unix_s, raw in read_tlog(file):
@@ -151,13 +152,8 @@ class _Reader:
                     begins_at = previous_unix_s = unix_s
                 elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
                     step_s = unix_s - previous_unix_s
-                    if abs(step_s) > _DOUBTFUL_JUMP_S:
-                        is_like_skipped = abs(unix_s - doubtful_unix_s) <= _DOUBTFUL_JUMP_S
-                        if not is_like_skipped:
-                            doubtful_unix_s = unix_s
-                            damaged += 1
-                            continue
-                        damaged -= 1  # the skipped record was not damaged
+                    if abs(step_s) > _DOUBTFUL_JUMP_S and self._is_time_damaged(unix_s):
+                        continue
                     if step_s > 0:
                         paused_s += step_s
                     else:
@@ -195,13 +191,22 @@ class _Reader:
                     continue
                 message = _decoded(raw, unix_s)
                 if message is None:
-                    damaged += 1
+                    self._damaged += 1
                 else:
                     handle(unix_s - begins_at, message)
             on_bytes(file.tell())
         flight.begins_at, flight.ends_at = begins_at, ends_at
         link.end(new_frames, last_frame_at - begins_at, flight.duration_s, paused_s)
-        self._finish(damaged)
+        self._finish()
+
+    def _is_time_damaged(self, unix_s: float) -> bool:
+        """Return False if a record's time is near that of the last record for which this has returned True."""
+        if abs(unix_s - self._doubtful_unix_s) <= _DOUBTFUL_JUMP_S:
+            self._damaged -= 1  # the clock has jumped, so the skipped record was not damaged
+            return False
+        self._doubtful_unix_s = unix_s
+        self._damaged += 1
+        return True
 
     def _note_clock(self, set_back_s: float, time_s: float) -> None:
         self._flight.notes.append(
@@ -209,14 +214,14 @@ class _Reader:
             " in this report continue without this jump"
         )
 
-    def _finish(self, damaged: int) -> None:
+    def _finish(self) -> None:
         flight = self._flight
         self._add_texts(flight.duration_s, self._texts.expire(math.inf))
         self._note_missing_heartbeats()
         self._add_destinations()
         flight.mission = self._mission.waypoints
-        if damaged:
-            flight.notes.append(f"{damaged} messages are damaged and were skipped")
+        if self._damaged:
+            flight.notes.append(f"{self._damaged} messages are damaged and were skipped")
         if self._other_vehicles:
             others = ", ".join(map(str, sorted(self._other_vehicles)))
             flight.notes.append(
@@ -326,7 +331,8 @@ class _Reader:
         self._end_heartbeat_gap(self._flight.duration_s)
 
         def silent_s(begin_s: float, end_s: float) -> float:
-            overlaps = (min(end_s, s.ends_s) - max(begin_s, s.begins_s) for s in self._flight.silences)
+            silences = self._flight.silences
+            overlaps = (min(end_s, silence.ends_s) - max(begin_s, silence.begins_s) for silence in silences)
             return sum(max(overlap_s, 0.0) for overlap_s in overlaps)
 
         # Silences, in which no message at all arrived, are left out: the report describes them separately.

@@ -152,7 +152,7 @@ class TlogReader(LogReader):
                 columns.append(TableColumn(name, field.name, "str"))
             elif field.array_length:
                 indices = range(field.array_length)
-                columns += [TableColumn(f"{name}_{i}", f"{field.name}.{i}", kind) for i in indices]
+                columns += [TableColumn(f"{name}_{index}", f"{field.name}.{index}", kind) for index in indices]
             else:
                 columns.append(TableColumn(name, field.name, kind))
         return columns

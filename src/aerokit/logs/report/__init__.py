@@ -14,7 +14,7 @@ from aerokit.logs.flights.failsafes import failsafes
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.report.charts import COLOURS, timeline_shapes
 from aerokit.logs.report.comparing import NAMES, comparison
-from aerokit.logs.report.formatting import date
+from aerokit.logs.report.formatting import date_text
 from aerokit.logs.report.page import Summary, page
 from aerokit.logs.report.sections import SECTIONS
 from aerokit.logs.report.statistics import FlightStatistics, findings, statistics_of, summary
@@ -117,4 +117,4 @@ def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summar
 
 
 def _heading(flight: FlightLog) -> str:
-    return f"{flight.vehicle}, system {flight.system_id}, {date(flight.begins_at)}"
+    return f"{flight.vehicle}, system {flight.system_id}, {date_text(flight.begins_at)}"

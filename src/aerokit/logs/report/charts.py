@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.logs.flights.failsafes import Failsafe, failsafes
 from aerokit.logs.flights.falls import Fall, falls
 from aerokit.logs.flights.flight import ModeChange, TangentPlane
-from aerokit.logs.report.formatting import clock
+from aerokit.logs.report.formatting import clock_text
 from aerokit.logs.report.page import Chart, Paragraphs
 from aerokit.logs.report.simplification import MAX_COORDINATE, simplify
 from aerokit.logs.report.statistics import metres_from_home
@@ -77,9 +77,9 @@ def series_colour(number: int) -> str:
     return f"colour:series{number % len(_SERIES_COLOURS['light'])}"
 
 
-def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
+def drawn_points(series: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
     """Return the times and values to draw for a column. The value None interrupts the line."""
-    values, times = columns[name], columns.times
+    values, times = series[name], series.times
     rows = rows_to_draw(values)
     return (
         [round(times[row], 2) for row in rows],
@@ -116,25 +116,25 @@ def mode_colours(flight: FlightLog) -> dict[str, str]:
     return {name: f"colour:mode{number % len(_MODE_COLOURS['light'])}" for number, name in enumerate(names)}
 
 
-def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
-    """Return a column as a line of a chart over time; None if all of its values are unknown."""
-    if not columns.has(column):
+def line_trace(name: str, series: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
+    """Return a column as a line of a timeline; None if all of its values are unknown."""
+    if not series.has(column):
         return None
-    x, y = points(columns, column, digits)
+    x, y = drawn_points(series, column, digits)
     return {"x": x, "y": y, "name": name, "mode": "lines", "connectgaps": False, **style}
 
 
-def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) -> dict[str, Any] | None:
-    trace = line(name, columns, column, digits, line={"color": _SETPOINT, "dash": "dot", "width": 1.5})
+def setpoint_trace(series: TimeSeries, column: str, digits: int = 3) -> dict[str, Any] | None:
+    trace = line_trace("set-point", series, column, digits, line={"color": _SETPOINT, "dash": "dot", "width": 1.5})
     if trace is not None:
         trace["connectgaps"] = True
     return trace
 
 
-def over_time(
+def timeline(
     flight: FlightLog, name: str, unit: str, traces: Sequence[dict[str, Any] | None], **layout: Any
 ) -> Chart | None:
-    """Return a timeline with these lines; None if there are no lines."""
+    """Return a chart over time with these traces; None if there are none."""
     drawn = [trace for trace in traces if trace is not None]
     if not drawn:
         return None
@@ -275,7 +275,7 @@ def _coordinates(places: Iterable[tuple[float, float] | None]) -> dict[str, list
 
 
 def _hover_text(time_s: float, height_m: float) -> str:
-    return clock(time_s) if math.isnan(height_m) else f"{clock(time_s)}, {height_m:.1f} m up"
+    return clock_text(time_s) if math.isnan(height_m) else f"{clock_text(time_s)}, {height_m:.1f} m up"
 
 
 def rounded(value: float) -> float | None:
@@ -353,7 +353,7 @@ def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) 
             row = flight.track.index_at(event.time_s)
             if row >= 0 and not math.isnan(math.hypot(*places[row])):
                 event_places.append(places[row])
-                names.append(f"{event.title}, {clock(event.time_s)}")
+                names.append(f"{event.title}, {clock_text(event.time_s)}")
         if event_places:
             markers.append(_marker(legend, event_places, symbol=symbol, colour=_FAILSAFE, size=12, texts=names))
     return markers

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.report.charts import (
+    drawn_points,
     drawn_track,
     map_layout,
-    points,
     rounded,
     series_colour,
     simplification_note,
@@ -120,11 +120,11 @@ def _overlay_section(
 ) -> Section:
     traces, names_without_data = [], []
     for number, flight in enumerate(flights):
-        columns = get_series(flight)
-        if columns is None or not columns.has(column):
+        series = get_series(flight)
+        if series is None or not series.has(column):
             names_without_data.append(NAMES[number])
             continue
-        times, values = points(columns, column)
+        times, values = drawn_points(series, column)
         armed_s = _armed_at(flight)
         traces.append({"x": [round(time - armed_s, 2) for time in times], "y": values, **_line_style(number)})
     if not traces:

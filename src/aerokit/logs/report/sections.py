@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.failsafes import failsafes
 from aerokit.logs.flights.flight import battery_name
-from aerokit.logs.report.charts import line, over_time, setpoint_line, track_parts
-from aerokit.logs.report.formatting import clock, date, span
+from aerokit.logs.report.charts import line_trace, setpoint_trace, timeline, track_parts
+from aerokit.logs.report.formatting import clock_text, date_text, duration_text
 from aerokit.logs.report.page import Collapsed, Paragraphs, Section, Table
 from aerokit.logs.report.silences import silence_sentences
 from aerokit.mavlink.enums import MavSeverity
@@ -57,11 +57,11 @@ def _map(flight: FlightLog) -> Section:
 
 def _heights(flight: FlightLog) -> Section:
     relative = "altitude_relative_m"
-    chart = over_time(
+    chart = timeline(
         flight,
         "heights",
         "metres above home",
-        [setpoint_line("set-point", flight.position_target, relative), line("actual", flight.track, relative)],
+        [setpoint_trace(flight.position_target, relative), line_trace("actual", flight.track, relative)],
     )
     explanation = "In all charts, background colours are modes, as in the map, and red lines are failsafes and falls."
     return _with_parts(Section("Height", explanation=explanation, missing="The log contains no heights."), chart)
@@ -71,7 +71,11 @@ def _modes(flight: FlightLog) -> Section:
     if not flight.modes:
         return Section("Modes", missing="The log contains no modes.")
     armed = [
-        (clock(begin), clock(end) if end < flight.duration_s else "not before the end", span(end - begin))
+        (
+            clock_text(begin),
+            clock_text(end) if end < flight.duration_s else "not before the end",
+            duration_text(end - begin),
+        )
         for begin, end in flight.armed
     ]
     times = Table(("armed", "disarmed", "duration"), armed, f"armed {len(armed)} times")
@@ -80,7 +84,7 @@ def _modes(flight: FlightLog) -> Section:
 
 def mode_table(flight: FlightLog) -> Table:
     rows = [
-        (clock(change.time_s), change.name, span(end - change.time_s), change.reason)
+        (clock_text(change.time_s), change.name, duration_text(end - change.time_s), change.reason)
         for change, end in flight.mode_spans()
     ]
     return Table(("time", "mode", "duration", "reason"), rows, f"{len(rows)} modes")
@@ -110,8 +114,8 @@ def failsafe_section(flight: FlightLog) -> Section:
 
 def _failsafe(failsafe: Failsafe) -> Table:
     kind, mark = ("failsafe", "bad") if failsafe.acted else ("warning", "warning")
-    head = f"{clock(failsafe.time_s)} {failsafe.title} ({kind}): {failsafe.reaction}"
-    rows = [("evidence", f"{clock(item.time_s)} {item.text}") for item in failsafe.evidence]
+    head = f"{clock_text(failsafe.time_s)} {failsafe.title} ({kind}): {failsafe.reaction}"
+    rows = [("evidence", f"{clock_text(item.time_s)} {item.text}") for item in failsafe.evidence]
     rows += [("context", text) for text in failsafe.context]
     return Table((kind, head), rows, title=head, marks=[mark] * len(failsafe.evidence))
 
@@ -131,7 +135,7 @@ def _attitude(flight: FlightLog) -> Section:
 def _velocity(flight: FlightLog) -> Section:
     section = Section("Velocity, actual and set-point", missing="The log contains no velocity.")
     columns = {name: f"{name}_m_s" for name in ("north", "east", "down")}
-    air = over_time(flight, "air", "air speed, m/s", [_air_speed_line(flight)], height=220)
+    air = timeline(flight, "air", "air speed, m/s", [_air_speed_line(flight)], height=220)
     return _with_parts(
         section, *_actual_and_setpoint(flight, "velocity", "m/s", flight.velocity_target, flight.velocity, columns), air
     )
@@ -142,11 +146,11 @@ def _actual_and_setpoint(
 ) -> list[Part | None]:
     """Return a chart for each entry of ``columns``, which maps labels to names of columns."""
     charts = [
-        over_time(
+        timeline(
             flight,
             f"{quantity}-{name}",
             f"{name}, {unit}",
-            [setpoint_line("set-point", setpoints, column, 2), line("actual", actual, column, 2)],
+            [setpoint_trace(setpoints, column, digits=2), line_trace("actual", actual, column, digits=2)],
             height=220,
         )
         for name, column in columns.items()
@@ -159,7 +163,7 @@ def _actual_and_setpoint(
 def _air_speed_line(flight: FlightLog) -> dict[str, Any] | None:
     # Without a sensor, all air speeds are 0.
     has_speed = flight.air.has("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
-    return line("air speed", flight.air, "air_speed_m_s", 2) if has_speed else None
+    return line_trace("air speed", flight.air, "air_speed_m_s", digits=2) if has_speed else None
 
 
 def _batteries(flight: FlightLog) -> Section:
@@ -171,9 +175,10 @@ def _batteries(flight: FlightLog) -> Section:
         ("remaining_percent", "% remaining", 1),
     ):
         lines = [
-            line(battery_name(number), battery, name, digits) for number, battery in sorted(flight.batteries.items())
+            line_trace(battery_name(number), battery, name, digits=digits)
+            for number, battery in sorted(flight.batteries.items())
         ]
-        charts.append(over_time(flight, f"battery-{name}", unit, lines, height=220))
+        charts.append(timeline(flight, f"battery-{name}", unit, lines, height=220))
     return _with_parts(section, *charts)
 
 
@@ -187,10 +192,9 @@ def _vibration(flight: FlightLog) -> Section:
     names = {"x_m_s2": "x", "y_m_s2": "y", "z_m_s2": "z"}
     if flight.autopilot == "PX4" and not flight.vibration.has("y_m_s2"):
         names = {"x_m_s2": "all axes"}
-    levels = over_time(
-        flight, "vibration", "m/s²", [line(label, flight.vibration, name, 2) for name, label in names.items()]
-    )
-    clips = over_time(flight, "clips", "clips", [line("clips", flight.vibration, "clips", 0)], height=180)
+    axes = [line_trace(label, flight.vibration, name, digits=2) for name, label in names.items()]
+    levels = timeline(flight, "vibration", "m/s²", axes)
+    clips = timeline(flight, "clips", "clips", [line_trace("clips", flight.vibration, "clips", digits=0)], height=180)
     return _with_parts(section, levels, clips)
 
 
@@ -202,11 +206,11 @@ def _estimator(flight: FlightLog) -> Section:
         missing="The log contains no estimator data.",
     )
     limit = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": 1, "y1": 1}
-    chart = over_time(
+    chart = timeline(
         flight,
         "estimator",
         "ratio",
-        [line(name.replace("_", " "), flight.estimator, name) for name in flight.estimator],
+        [line_trace(name.replace("_", " "), flight.estimator, name) for name in flight.estimator],
         shapes=[{**limit, "line": {"color": "colour:failsafe", "width": 1}}],
     )
     return _with_parts(section, chart)
@@ -222,9 +226,9 @@ def _gps(flight: FlightLog) -> Section:
     section = Section("Satellites", missing="The log contains no GNSS data.")
     charts = []
     for name, unit in (("satellites", "satellites"), ("hdop", "HDOP"), ("fix_type", "fix type")):
-        lines = [line(f"receiver {number + 1}", gps, name, 2) for number, gps in sorted(flight.gps.items())]
+        lines = [line_trace(f"receiver {index + 1}", gps, name, digits=2) for index, gps in sorted(flight.gps.items())]
         axis = _fix_type_axis(flight) if name == "fix_type" else {}
-        charts.append(over_time(flight, f"gps-{name}", unit, lines, height=200, yaxis=axis))
+        charts.append(timeline(flight, f"gps-{name}", unit, lines, height=200, yaxis=axis))
     return _with_parts(section, *charts)
 
 
@@ -244,15 +248,14 @@ def _link(flight: FlightLog) -> Section:
         missing="The log contains no link data. A .bin has the reports of a telemetry radio only, a .ulg also PX4's own"
         " counts.",
     )
-    lost = over_time(flight, "lost", "% lost", [line("lost", flight.link, "lost_percent", 1)], height=220)
-    rate = over_time(
-        flight, "received", "messages per second", [line("received", flight.link, "received_hz", 0)], height=180
-    )
-    radio = over_time(
+    lost = timeline(flight, "lost", "% lost", [line_trace("lost", flight.link, "lost_percent", digits=1)], height=220)
+    received = line_trace("received", flight.link, "received_hz", digits=0)
+    rate = timeline(flight, "received", "messages per second", [received], height=180)
+    radio = timeline(
         flight,
         "radio",
         "units of the radio",
-        [line(name.replace("_", " "), flight.radio, name, 0) for name in flight.radio],
+        [line_trace(name.replace("_", " "), flight.radio, name, digits=0) for name in flight.radio],
         height=220,
     )
     silences = silence_sentences(flight)
@@ -266,7 +269,7 @@ def _texts(flight: FlightLog) -> Section:
     for text in flight.texts[:_MAX_TEXTS]:
         severity = text.severity
         name = "—" if severity is None else _SEVERITIES[min(max(severity, 0), 7)]
-        rows.append((clock(text.time_s), name, text.text))
+        rows.append((clock_text(text.time_s), name, text.text))
         if severity is None or severity > MavSeverity.WARNING:
             marks.append("")
         else:
@@ -287,7 +290,7 @@ def _parameters(flight: FlightLog) -> Section:
         change for change in flight.parameter_changes if not any(part in change.name for part in _WRITTEN_BY_AUTOPILOT)
     ]
     rows = [
-        (clock(change.time_s), change.name, f"{change.before:g}", f"{change.after:g}")
+        (clock_text(change.time_s), change.name, f"{change.before:g}", f"{change.after:g}")
         for change in changes[:_MAX_CHANGES]
     ]
     parts: list[Part] = [Paragraphs(["The log contains no change of a parameter by the pilot or a program."])]
@@ -340,7 +343,7 @@ def _about(flight: FlightLog) -> Section:
     rows = [
         ("file", flight.path.name),
         ("vehicle", f"{flight.vehicle}, system {flight.system_id}"),
-        ("start", date(flight.begins_at)),
+        ("start", date_text(flight.begins_at)),
         ("duration", _duration(flight)),
     ]
     if flight.home is not None:
@@ -350,8 +353,8 @@ def _about(flight: FlightLog) -> Section:
 
 def _duration(flight: FlightLog) -> str:
     if flight.speed == 1.0:
-        return span(flight.duration_s)
-    return f"{span(flight.duration_s)} simulated, {span(flight.duration_s / flight.speed)} recorded"
+        return duration_text(flight.duration_s)
+    return f"{duration_text(flight.duration_s)} simulated, {duration_text(flight.duration_s / flight.speed)} recorded"
 
 
 SECTIONS: tuple[Callable[[FlightLog], Section | None], ...] = (

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.autopilots.failsafes import GCS_FAILSAFE_ACTIONS, gcs_failsafe
-from aerokit.logs.report.formatting import clock, span
+from aerokit.logs.report.formatting import clock_text, duration_text
 
 if TYPE_CHECKING:
     from aerokit.logs.flights.flight import FlightLog, Silence
@@ -47,8 +47,8 @@ def _pauses(pauses: list[Silence]) -> list[str]:
     others = len(pauses) - 1
     more = f", and in {others} shorter gap{'' if others == 1 else 's'}" if others else ""
     return [
-        f"The log contains no message of the vehicle for {span(longest.ends_s - longest.begins_s)} from"
-        f" {clock(longest.begins_s)} on{more}: the vehicle was silent, the recording paused,"
+        f"The log contains no message of the vehicle for {duration_text(longest.ends_s - longest.begins_s)} from"
+        f" {clock_text(longest.begins_s)} on{more}: the vehicle was silent, the recording paused,"
         " or its clock was set forward."
     ]
 
@@ -56,8 +56,8 @@ def _pauses(pauses: list[Silence]) -> list[str]:
 def _sentence(flight: FlightLog, silence: Silence) -> str:
     is_at_end = silence.ends_s >= flight.duration_s
     before = _state(flight, silence.begins_s)
-    text = f"Nothing was received from the vehicle for {span(silence.ends_s - silence.begins_s)}"
-    text += f" from {clock(silence.begins_s)} on"
+    text = f"Nothing was received from the vehicle for {duration_text(silence.ends_s - silence.begins_s)}"
+    text += f" from {clock_text(silence.begins_s)} on"
     if is_at_end:
         text += ", until the log ends"
     text += f"; it was last {before}." if before else "."

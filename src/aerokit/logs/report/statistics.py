@@ -12,7 +12,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.logs.flights.failsafes import failsafe_parameters, failsafes
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import TangentPlane, battery_name
-from aerokit.logs.report.formatting import clock, length, number, span
+from aerokit.logs.report.formatting import clock_text, distance_text, duration_text, number_text
 from aerokit.logs.report.silences import silence_sentences
 
 if TYPE_CHECKING:
@@ -114,25 +114,25 @@ STATISTICS = {
 def statistics_of(flight: FlightLog) -> FlightStatistics:
     spans = _ArmedSpans(flight)
     north_east = metres_from_home(flight)
-    rows = list(spans.rows(flight.track))
-    home_distances = [math.hypot(*north_east[row]) for row in rows] if north_east else []
+    track_rows = list(spans.rows(flight.track))
+    home_distances = [math.hypot(*north_east[row]) for row in track_rows] if north_east else []
     speeds = [
         math.hypot(flight.velocity["north_m_s"][row], flight.velocity["east_m_s"][row])
         for row in spans.rows(flight.velocity)
     ]
-    sink_rates = spans.known(flight.velocity, "down_m_s")
-    tilts = [abs(angle) for name in ("roll_deg", "pitch_deg") for angle in spans.known(flight.attitude, name)]
+    sink_rates = spans.known_values(flight.velocity, "down_m_s")
+    tilts = [abs(angle) for name in ("roll_deg", "pitch_deg") for angle in spans.known_values(flight.attitude, name)]
     voltages, remaining, currents = (
-        spans.known_of_first(flight.batteries, name) for name in ("voltage_v", "remaining_percent", "current_a")
+        spans.known_values_of_first(flight.batteries, name) for name in ("voltage_v", "remaining_percent", "current_a")
     )
-    satellites, hdops = (spans.known_of_first(flight.gps, name) for name in ("satellites", "hdop"))
-    levels = [level for axis in "xyz" for level in spans.known(flight.vibration, f"{axis}_m_s2")]
-    clips = spans.known(flight.vibration, "clips")
-    ratios = [ratio for name in flight.estimator for ratio in spans.known(flight.estimator, name)]
+    satellites, hdops = (spans.known_values_of_first(flight.gps, name) for name in ("satellites", "hdop"))
+    vibrations = [level for axis in "xyz" for level in spans.known_values(flight.vibration, f"{axis}_m_s2")]
+    clips = spans.known_values(flight.vibration, "clips")
+    estimator_ratios = [ratio for name in flight.estimator for ratio in spans.known_values(flight.estimator, name)]
     return FlightStatistics(
         armed_s=sum(end - begin for begin, end in flight.armed) if flight.armed else None,
-        distance_m=_path_length(north_east, rows) if north_east else None,
-        max_height_m=_max(spans.known(flight.track, "altitude_relative_m")),
+        distance_m=_path_length(north_east, track_rows) if north_east else None,
+        max_height_m=_max(spans.known_values(flight.track, "altitude_relative_m")),
         max_distance_m=_max(home_distances),
         max_speed_m_s=_max(speeds),
         max_climb_m_s=_max([-sink_rate for sink_rate in sink_rates]),
@@ -147,9 +147,9 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
         max_current_a=_max(currents),
         min_satellites=min(satellites, default=None),
         max_hdop=_max(hdops),
-        max_vibration_m_s2=_max(levels),
+        max_vibration_m_s2=_max(vibrations),
         clips=sum(max(after - before, 0.0) for before, after in pairwise(clips)) if clips else None,
-        max_estimator_ratio=_max(ratios),
+        max_estimator_ratio=_max(estimator_ratios),
         lost_percent=spans.mean(flight.link, "lost_percent"),
     )
 
@@ -181,24 +181,24 @@ class _ArmedSpans:
     def __init__(self, flight: FlightLog) -> None:
         self._spans = flight.armed or [(-math.inf, math.inf)]
 
-    def rows(self, columns: TimeSeries) -> Iterator[int]:
+    def rows(self, series: TimeSeries) -> Iterator[int]:
         for begin, end in self._spans:
-            yield from range(bisect_left(columns.times, begin), bisect_right(columns.times, end))
+            yield from range(bisect_left(series.times, begin), bisect_right(series.times, end))
 
-    def known(self, columns: TimeSeries, name: str) -> list[float]:
-        times, values = columns.times, columns[name]
+    def known_values(self, series: TimeSeries, name: str) -> list[float]:
+        times, values = series.times, series[name]
         known: list[float] = []
         for begin, end in self._spans:
             part = values[bisect_left(times, begin) : bisect_right(times, end)]
             known += [value for value in part if math.isfinite(value)]
         return known
 
-    def known_of_first(self, by_number: dict[int, TimeSeries], name: str) -> list[float]:
-        return self.known(by_number[min(by_number)], name) if by_number else []
+    def known_values_of_first(self, by_number: dict[int, TimeSeries], name: str) -> list[float]:
+        return self.known_values(by_number[min(by_number)], name) if by_number else []
 
-    def mean(self, columns: TimeSeries, name: str) -> float | None:
+    def mean(self, series: TimeSeries, name: str) -> float | None:
         """Return the time-weighted average of a column in the spans."""
-        times, values = columns.times, columns[name]
+        times, values = series.times, series[name]
         total, weight = 0.0, 0.0
         for begin, end in self._spans:
             for row in range(bisect_left(times, begin), bisect_right(times, end)):
@@ -364,8 +364,8 @@ def fall_text(fall: Fall) -> str:
     """Describe a fall: ``Fall: from 28.7 m, 16.9 m/s at the ground, at 0:24.9 (descent since 0:21.3); REASON``."""
     end = "at the ground" if fall.has_impact else "when the log ends"
     text = (
-        f"{fall.title}: from {fall.height_m:.1f} m, {fall.sink_m_s:.1f} m/s {end}, at {clock(fall.time_s)}"
-        f" (descent since {clock(fall.begins_s)})"
+        f"{fall.title}: from {fall.height_m:.1f} m, {fall.sink_m_s:.1f} m/s {end}, at {clock_text(fall.time_s)}"
+        f" (descent since {clock_text(fall.begins_s)})"
     )
     return "; ".join([text, *fall.reasons])
 
@@ -386,25 +386,25 @@ def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
 
 def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
     if statistics.armed_s is None:
-        return f"No arming was logged in {span(flight.duration_s)}."
-    parts = [f"{span(statistics.armed_s)} armed{_until_impact(flight, statistics.armed_s)}"]
+        return f"No arming was logged in {duration_text(flight.duration_s)}."
+    parts = [f"{duration_text(statistics.armed_s)} armed{_until_impact(flight, statistics.armed_s)}"]
     if statistics.distance_m is not None:
-        parts.append(f"{length(statistics.distance_m)} flown over ground")
+        parts.append(f"{distance_text(statistics.distance_m)} flown over ground")
     if statistics.max_height_m is not None:
-        parts.append(f"max height {number(statistics.max_height_m)} m above home")
+        parts.append(f"max height {number_text(statistics.max_height_m)} m above home")
     if statistics.max_distance_m is not None:
-        parts.append(f"max distance {length(statistics.max_distance_m)} from home")
+        parts.append(f"max distance {distance_text(statistics.max_distance_m)} from home")
     if statistics.max_speed_m_s is not None:
-        parts.append(f"max ground speed {number(statistics.max_speed_m_s)} m/s")
+        parts.append(f"max ground speed {number_text(statistics.max_speed_m_s)} m/s")
     if statistics.end_distance_m is not None:
-        parts.append(f"ended {length(statistics.end_distance_m)} from home")
+        parts.append(f"ended {distance_text(statistics.end_distance_m)} from home")
     return ", ".join(parts) + "."
 
 
 def _until_impact(flight: FlightLog, armed_s: float) -> str:
     impact_s = next((fall.time_s for fall in falls(flight) if fall.has_impact and not fall.is_hard_landing), math.inf)
     armed_before_s = sum(max(min(end, impact_s) - begin, 0.0) for begin, end in flight.armed)
-    return f" ({span(armed_before_s)} until the impact)" if armed_s - armed_before_s >= 1.0 else ""
+    return f" ({duration_text(armed_before_s)} until the impact)" if armed_s - armed_before_s >= 1.0 else ""
 
 
 def _modes_sentence(flight: FlightLog) -> str:
@@ -413,7 +413,7 @@ def _modes_sentence(flight: FlightLog) -> str:
         return ""
     # Modes that lasted less than half a second are omitted, unless all did.
     longer = {name: seconds for name, seconds in seconds_by_mode.items() if seconds >= 0.5}
-    modes = [f"{name} ({span(seconds)})" for name, seconds in (longer or seconds_by_mode).items()]
+    modes = [f"{name} ({duration_text(seconds)})" for name, seconds in (longer or seconds_by_mode).items()]
     return f"{'Flown in' if flight.armed else 'In'} {', '.join(modes)}."
 
 
@@ -431,7 +431,7 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 def _failsafes_sentence(flight: FlightLog) -> str:
     acted, warnings, warning_kinds = [], [], []
     for failsafe in failsafes(flight):
-        at = f"{failsafe.title} at {clock(failsafe.time_s)}"
+        at = f"{failsafe.title} at {clock_text(failsafe.time_s)}"
         if failsafe.acted:
             acted.append(f"{at} ({failsafe.reaction})")
         else:
