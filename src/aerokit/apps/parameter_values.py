@@ -14,27 +14,27 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ParameterWrite
 
 
-def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
+def check_values(metadata: Metadata | None, values: Mapping[str, float], *, force_option: str) -> None:
     """Raise InvalidArgument if the metadata does not allow some of the values.
 
-    Names without metadata are accepted. The text mentions ``force``, the option that sets the values nevertheless.
+    Names without metadata are accepted. The text mentions ``force_option``, which sets the values nevertheless.
     """
     if metadata is None:
         return
     problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
     if problems:
-        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets these values nevertheless")
+        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force_option} sets these values nevertheless")
 
 
-def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:
+def with_range_note(metadata: Metadata | None, result: ParameterWrite, *, metadata_option: str) -> ParameterWrite:
     """Add a note to the result if the value was set without a check of its range.
 
-    The note mentions ``option``, the command line option that loads metadata with ranges.
+    The note mentions ``metadata_option``, the command line option that loads metadata with ranges.
     """
     if result.error is not None or result.outcome == "unchanged":
         return result
     if metadata is None:
-        text = f"range not checked ({option} checks it)"
+        text = f"range not checked ({metadata_option} checks it)"
     else:
         entry, _ = metadata_entry(metadata, result.name)
         if entry is not None:

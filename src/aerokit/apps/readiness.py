@@ -53,29 +53,29 @@ class Readiness(NamedTuple):
         return "cannot arm" if self.is_known else "not known whether it arms"
 
 
-def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes_mode: bool = False) -> Readiness:
+def readiness(vehicle: Vehicle, reported: Sequence[str] | None = None, *, changes_mode: bool = False) -> Readiness:
     """Return the reasons why a vehicle cannot arm, and why it cannot fly. Nothing is sent.
 
-    ``reasons`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against arming are derived from
+    ``reported`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against arming are derived from
     the received states. With ``changes_mode``, the present mode is not checked, because `Vehicle.arm` will change it.
     """
-    grouped = _group_reasons(vehicle, reasons)
-    if reasons is not None or changes_mode:  # `reasons` includes a refusal because of the mode
+    grouped = _group_reasons(vehicle, reported)
+    if reported is not None or changes_mode:  # `reported` includes a refusal because of the mode
         return grouped
     against_arming = dict.fromkeys([*_refused_mode(vehicle), *grouped.against_arming])
     return grouped._replace(against_arming=tuple(against_arming))
 
 
-def _group_reasons(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
+def _group_reasons(vehicle: Vehicle, reported: Sequence[str] | None) -> Readiness:
     """Group the reasons into those against arming and those against flight. The mode itself is not checked."""
     missing = vehicle.missing_for_flight()
-    against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
+    against_arming = tuple(_needed_to_arm(vehicle, missing) if reported is None else reported)
     sensors = vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     if checks_pass and all(map(_is_about_estimates, against_arming)):
         # Whether missing estimates prevent arming depends on the mode. ArduCopter without a position arms in STABILIZE,
         # but not in GUIDED.
-        refusals = tuple(arm_refusals(vehicle, missing)) if reasons is None else ()
+        refusals = tuple(arm_refusals(vehicle, missing)) if reported is None else ()
         all_reasons = dict.fromkeys([*missing, *against_arming])
         return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))
     is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against_arming)

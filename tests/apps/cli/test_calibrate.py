@@ -36,10 +36,10 @@ def entered(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Replace the question whether the pose is reached by these answers, then by True."""
     answers: list[bool] = []
 
-    async def press_enter() -> bool:
+    async def wait_for_enter() -> bool:
         return answers.pop(0) if answers else True
 
-    monkeypatch.setattr(calibrate, "press_enter", press_enter)
+    monkeypatch.setattr(calibrate, "wait_for_enter", wait_for_enter)
     return answers
 
 

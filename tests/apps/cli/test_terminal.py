@@ -69,7 +69,7 @@ class FullTerminal(Terminal):
 
 def test_countdown_error_does_not_replace_error_of_block(monkeypatch: pytest.MonkeyPatch) -> None:
     async def wait() -> None:
-        async with asking.waiting(argparse.Namespace(json=False), "tcp:127.0.0.1:1", 30.0):
+        async with asking.showing_countdown(argparse.Namespace(json=False), "tcp:127.0.0.1:1", 30.0):
             await asyncio.sleep(3.0)
             raise LookupError
 

@@ -16,7 +16,7 @@ from flight_harness import Flight, Px4Flight, open_flight, open_px4
 
 import aerokit
 from aerokit import messages as m
-from aerokit.apps.cli.devices import _file_name, _show
+from aerokit.apps.cli.devices import _file_name, _print_and_download
 from aerokit.errors import AerokitError, NotSupported, OperationTimeout
 from aerokit.events import ImageCaptured
 from aerokit.mavlink.encoder import FrameEncoder
@@ -391,7 +391,7 @@ async def test_definition_does_not_overwrite_files(tmp_path: Path, capsys: pytes
         other = capture.replace(file_url="mftp:///DCIM/101/IMG_0001.JPG")
         options = Namespace(to=tmp_path, json=False)
         for photo in (capture, other, other.replace(index=1)):
-            assert await _show(options, vehicle.camera, photo)
+            assert await _print_and_download(options, vehicle.camera, photo)
         assert names(tmp_path) == [
             "00000-IMG_0001-2.JPG",
             "00000-IMG_0001.JPG",
@@ -400,7 +400,8 @@ async def test_definition_does_not_overwrite_files(tmp_path: Path, capsys: pytes
         assert (tmp_path / "00000-IMG_0001-2.JPG").read_bytes() == b"another"
         assert (tmp_path / "00000-IMG_0001.JPG").read_bytes() != b"another"
         capsys.readouterr()
-        assert not await _show(options, vehicle.camera, capture.replace(file_url="mftp:///a/..%2Fb\x1b[2J"))
+        unsafe = capture.replace(file_url="mftp:///a/..%2Fb\x1b[2J")
+        assert not await _print_and_download(options, vehicle.camera, unsafe)
         assert "\x1b" not in capsys.readouterr().out
         assert len(names(tmp_path)) == 3
 

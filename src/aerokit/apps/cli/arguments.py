@@ -57,7 +57,7 @@ def address(text: str) -> str:
 
 
 def address_or_template(text: str) -> str:
-    address(expand_address(text, 0, 1))
+    address(expand_address(text, number=0, system_id=1))
     return text
 
 

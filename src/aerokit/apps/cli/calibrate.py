@@ -12,7 +12,7 @@ import anyio.lowlevel
 from aerokit.apps.cli.arguments import system_id
 from aerokit.apps.cli.connecting import add_link, connect_to, signing_of
 from aerokit.apps.cli.output import DONE, INTERRUPTED, emit
-from aerokit.apps.cli.terminal import CLEAR_LINE, on_interrupt, press_enter
+from aerokit.apps.cli.terminal import CLEAR_LINE, on_interrupt, wait_for_enter
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID
 from aerokit.errors import InvalidArgument, NotSupported, OperationTimeout
 from aerokit.vehicle.calibration.values import CalibrationPose
@@ -125,7 +125,7 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
         with scope:
             async for step in calibration:
                 display.show(step)
-                if step.needs_confirmation and not await press_enter():
+                if step.needs_confirmation and not await wait_for_enter():
                     scope.cancel()
                     await anyio.lowlevel.checkpoint()  # a cancellation takes effect here, before the next step
         if scope.cancelled_caught:  # the calibration still runs on the vehicle
@@ -134,17 +134,16 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
 
 
 async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:
-    text = "cancelled on the vehicle"
-    is_cancelled = False
+    problem = ""
     try:
         with anyio.fail_after(_CANCEL_TIMEOUT_S):
             await calibration.cancel()
-        is_cancelled = True
     except (NotSupported, OperationTimeout) as error:
-        text = f"not cancelled on the vehicle: {error}"
-    except TimeoutError:  # This error has no text.
-        text = f"not cancelled on the vehicle: it did not confirm within {_CANCEL_TIMEOUT_S:g} s"
-    record = {"sensor": options.sensor, "is_cancelled": is_cancelled, "text": text}
+        problem = str(error)
+    except TimeoutError:  # of `fail_after`; it has no text
+        problem = f"it did not confirm within {_CANCEL_TIMEOUT_S:g} s"
+    text = f"not cancelled on the vehicle: {problem}" if problem else "cancelled on the vehicle"
+    record = {"sensor": options.sensor, "is_cancelled": not problem, "text": text}
     emit(options, "calibration_cancelled", record, f"{options.sensor}: {text}")
     return INTERRUPTED
 

@@ -14,7 +14,7 @@ import anyio
 from aerokit.apps.cli.arguments import add_baud, address, number, system_id
 from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.output import DONE, add_json, emit, emit_done
-from aerokit.apps.cli.terminal import confirm, is_interactive, on_interrupt, waiting
+from aerokit.apps.cli.terminal import confirm, is_interactive, on_interrupt, showing_countdown
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID, explain_no_vehicle, open_connection
 from aerokit.errors import ConnectFailed, InvalidArgument
 
@@ -234,7 +234,7 @@ async def connect_to(
 
     address = link if isinstance(link, str) else link.address
     async with AsyncExitStack() as stack:
-        async with waiting(options, address, _CONNECT_TIMEOUT_S):
+        async with showing_countdown(options, address, _CONNECT_TIMEOUT_S):
             vehicle = await stack.enter_async_context(
                 connect(link, system_id=options.system_id, timeout=_CONNECT_TIMEOUT_S, baud=options.baud, **connecting)
             )
@@ -276,7 +276,7 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 
     Raises ConnectFailed if there is none within ``patience_s``. The text describes what was received instead.
     """
-    async with waiting(options, connection.link.address, patience_s):
+    async with showing_countdown(options, connection.link.address, patience_s):
         with anyio.move_on_after(patience_s):
             async for _ in connection.vehicles():
                 return

@@ -17,7 +17,7 @@ import anyio
 from aerokit.apps.cli.connecting import add_link, add_seconds, opened
 from aerokit.apps.cli.doctor_link import BAUD_RATES, Finding, Level, LinkExamination, emit_finding, listen_at
 from aerokit.apps.cli.output import DONE, FAILED, NO_VEHICLE
-from aerokit.apps.cli.terminal import waiting
+from aerokit.apps.cli.terminal import showing_countdown
 from aerokit.errors import AerokitError, LinkOpenError
 from aerokit.transport import LinkAddress, parse_address
 from aerokit.transport.sockets import port_bind_error, serial_ports
@@ -146,7 +146,7 @@ def check_network_port(port: int, meaning: str, *, udp: bool) -> Finding:
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_doctor)
     add_link(command, default_text="check this computer")
-    add_seconds(command, "listen for S seconds (default: 6)", 6.0)
+    add_seconds(command, "listen for S seconds (default: 6)", default=6.0)
 
 
 async def run_doctor(options: argparse.Namespace) -> int:
@@ -190,7 +190,7 @@ async def _check_link(options: argparse.Namespace, report: Callable[[Finding], N
     try:
         async with opened(options) as connection:
             examination = LinkExamination(connection)
-            async with waiting(options, connection.link.address, options.seconds, "messages"):
+            async with showing_countdown(options, connection.link.address, options.seconds, what="messages"):
                 await anyio.sleep(options.seconds)
             for finding in examination.findings():
                 report(finding)
@@ -213,7 +213,7 @@ async def _find_baud_rate(
         report(port_finding)
     probes = []
     for rate in dict.fromkeys((configured_baud, *BAUD_RATES)):
-        async with waiting(options, f"{device} at {rate}", BAUD_RATE_TIMEOUT_S, "MAVLink"):
+        async with showing_countdown(options, f"{device} at {rate}", BAUD_RATE_TIMEOUT_S, what="MAVLink"):
             try:
                 probe = await listen_at(device, rate, BAUD_RATE_TIMEOUT_S)
             except AerokitError:  # reported later, when the link is opened

@@ -172,7 +172,7 @@ class PlanFlight(SupervisedFlight):
         vehicle = self._vehicle
         await self._wait_disarmed_on_ground()
         self._print(f"mission finished: {vehicle.describe_now()}")
-        emit(self._options, "flown", {"system_id": vehicle.system_id, "armed": vehicle.is_armed}, None)
+        emit(self._options, "flown", {"system_id": vehicle.system_id, "armed": vehicle.is_armed}, text=None)
         return DONE
 
     def _our_purposes(self) -> tuple[Purpose, ...]:

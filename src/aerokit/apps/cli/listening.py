@@ -27,7 +27,7 @@ from aerokit.apps.cli.connecting import (
     signing_of,
 )
 from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, can_print, emit, import_extra, new_recording
-from aerokit.apps.cli.terminal import on_interrupt, waiting
+from aerokit.apps.cli.terminal import on_interrupt, showing_countdown
 from aerokit.apps.event_text import event_details
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.events import Event, LinkReport, StatusTextReceived
@@ -159,7 +159,7 @@ async def _print_all(connection: Connection, options: argparse.Namespace) -> Non
     # get() raises an error when the connection ends. The error is suppressed, because await_end() raises it as well.
     with suppress(AerokitError), connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS) as events:
         missed = 0
-        async with waiting(options, connection.link.address, _COUNTDOWN_S):
+        async with showing_countdown(options, connection.link.address, _COUNTDOWN_S):
             event = await events.get()
         while True:
             while not can_print():  # noqa: ASYNC110 - printing would block the event loop, and with it our heartbeat

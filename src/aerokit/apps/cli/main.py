@@ -256,9 +256,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return FAILED
     except KeyboardInterrupt:
-        return _report(KeyboardInterrupt("interrupted"), options)
+        return _report_error(KeyboardInterrupt("interrupted"), options)
     except (AerokitError, OSError) as error:
-        return _report(error, options)
+        return _report_error(error, options)
     return code
 
 
@@ -269,7 +269,7 @@ def _installation_problem() -> str | None:
     return installation_problem(aerokit.__path__[0], is_ours="open_connection" in getattr(aerokit, "__all__", ()))
 
 
-def _report(error: BaseException, options: argparse.Namespace) -> int:
+def _report_error(error: BaseException, options: argparse.Namespace) -> int:
     code = exit_code(error)
     emit_error(error, code, as_json=getattr(options, "json", False))
     return code

@@ -282,7 +282,7 @@ async def _clear(options: argparse.Namespace) -> int:
     async with connected(options, changes_vehicle=True) as vehicle:
         for part in options.parts:
             await getattr(vehicle, part).clear(idle_timeout_s=options.patience)
-            emit_part(options, part, 0, "cleared", f"{part}: cleared")
+            emit_part(options, part, items=0, state="cleared", text=f"{part}: cleared")
     return DONE
 
 

@@ -105,7 +105,7 @@ async def _list(options: argparse.Namespace) -> int:
     matching = [parameter for name, parameter in table.items() if fnmatch.fnmatch(name, pattern)]
     _emit_parameters(options, matching, metadata)
     if not matching and options.pattern != "*":
-        hint = suggestion(options.pattern.strip("*"), table, 3)
+        hint = suggestion(options.pattern.strip("*"), table, count=3)
         print(f"aerokit: none of {len(table)} parameters matches {options.pattern!r}{hint}", file=sys.stderr)
         return FAILED
     return DONE
@@ -178,7 +178,10 @@ async def _set(options: argparse.Namespace) -> int:
     # Without metadata, every result would have the same note. Text output then has a single line at the end instead.
     has_notes = metadata is not None or options.json
     if has_notes and not options.force:
-        results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
+        results = {
+            name: with_range_note(metadata, result, metadata_option="--metadata FILE")
+            for name, result in results.items()
+        }
     code = _emit_results(options, results.values(), known_names, metadata)
     has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
     if has_changed and metadata is None and not (options.force or options.json):
@@ -228,7 +231,7 @@ def _check_file(file_values: ParameterFile, table: ParameterTable, vehicle: Vehi
         line = file_values.places[name]
         known = resolve_known(name.upper() if names_are_upper_case else name, table)
         if known is None:
-            unknown.append(f"{line}: the vehicle has no parameter {name}{suggestion(name, table, 3)}")
+            unknown.append(f"{line}: the vehicle has no parameter {name}{suggestion(name, table, count=3)}")
             continue
         try:
             checked_value(name, known.to_vehicle(value), known.parameter.type)
@@ -278,7 +281,7 @@ def _with_hint(name: str, error: Exception, known_names: Collection[str]) -> str
     # The error's own suggestions are replaced, because they include only parameters that were already read.
     bare_text, _, _ = text.partition(" (did you mean")
     beginnings = [known for known in known_names if len(known) >= _MIN_BEGINNING and name.upper().startswith(known)]
-    names = dict.fromkeys([*beginnings, *near_names(name, known_names, 3)])
+    names = dict.fromkeys([*beginnings, *near_names(name, known_names, count=3)])
     hint = " or ".join(map(repr, list(names)[:3]))
     return f"{bare_text} (did you mean {hint}?)" if hint else f"{bare_text}; `aerokit params list` shows all names"
 

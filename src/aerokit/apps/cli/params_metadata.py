@@ -103,7 +103,7 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
 
 
 def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
-    check_values(metadata, values, "--force")
+    check_values(metadata, values, force_option="--force")
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:

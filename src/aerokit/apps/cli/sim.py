@@ -95,7 +95,7 @@ def simulated_fleet(
         )
     latitude_deg, longitude_deg, altitude_m = home or HOME
     frame = LocalFrame(GlobalPoint(round(latitude_deg * 1e7), round(longitude_deg * 1e7), altitude_m))
-    homes = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
+    homes = [frame.to_global(north=0.0, east=number * spacing_m, down=0.0) for number in range(count)]
     return [
         simulated_vehicle(
             name,
@@ -330,7 +330,7 @@ def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> Non
         emit(options, "simulated", record, text if address == shared[0] else None)
     if not options.json:
         first_vehicle, *further_vehicles = server.vehicles_on[0]
-        argument = expand_address(options.addresses[0], 0, first_vehicle.system_id)
+        argument = expand_address(options.addresses[0], number=0, system_id=first_vehicle.system_id)
         client = _client_address(server.addresses[0], argument)
         system_option = f" --system-id {first_vehicle.system_id}" if further_vehicles else ""
         print(f"try: aerokit demo --connect {client}{system_option}", flush=True)

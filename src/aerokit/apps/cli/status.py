@@ -196,7 +196,7 @@ def _enum_name(enum: type[MavType | MavAutopilot], number: int) -> str:
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_status)
     add_link(command)
-    add_seconds(command, "listen for S seconds after the first heartbeat (default: 3)", 3.0)
+    add_seconds(command, "listen for S seconds after the first heartbeat (default: 3)", default=3.0)
     command.add_argument(
         "--patience",
         type=number(0.1, 3600),

@@ -42,7 +42,7 @@ async def confirm(question: str) -> bool:
     return answer.strip().lower() in ("y", "yes")
 
 
-async def press_enter() -> bool:
+async def wait_for_enter() -> bool:
     """Wait for a line of input. Return False at the end of the input."""
     _discard_typed_input()
     print("  press Enter when done (Ctrl-C cancels) ", end="", file=sys.stderr, flush=True)
@@ -153,7 +153,7 @@ class InterruptStack:
 
 
 @asynccontextmanager
-async def waiting(
+async def showing_countdown(
     options: argparse.Namespace, address: str, seconds: float, what: str = "a heartbeat"
 ) -> AsyncIterator[None]:
     """Within the block, show a countdown of ``seconds`` on stderr, such as "waiting for a heartbeat on COM3 … 9 s".

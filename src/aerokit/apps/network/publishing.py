@@ -83,7 +83,7 @@ class Publishing:
         is_link_wanted = not self._states or "link" in self._states
         # The statistics of the link change with every frame. They are therefore published every REPEAT_INTERVAL_S only.
         if is_link_wanted and self._is_repeat_due("link", now):
-            self._publish("link", overview(self._vehicle)["link"], 0.0, now)
+            self._publish("link", overview(self._vehicle)["link"], age_s=0.0, now=now)
 
     def _is_repeat_due(self, name: str, now: float) -> bool:
         sent_at, _ = self._sent.get(name, (-math.inf, None))

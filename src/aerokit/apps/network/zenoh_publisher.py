@@ -126,8 +126,4 @@ async def discover(
     finally:
         subscribers.clear()
         await run_shielded(_close(session))
-    names: set[str] = set()
-    for key in keys:
-        _, _, name, *_ = key.split("/")  # aerokit/FLEET/NAME/…
-        names.add(name)
-    return sorted(names)
+    return sorted({key.split("/")[2] for key in keys})  # the keys are aerokit/FLEET/NAME/…

@@ -88,7 +88,7 @@ class FlightWatch:
         # The last impact; None if there was none.
         self._impact_at: float | None = None
         self._impact_altitude_m: float | None = None
-        self._is_impact_dismissed = False
+        self._is_impact_dismissed = False  # True once the vehicle flies again or no evidence of a crash was found
         # Start of the time without motion after the impact, and number of velocity reports since then.
         self._still_since = math.inf
         self._still_samples = 0
@@ -123,9 +123,7 @@ class FlightWatch:
             return None
         at, armed_for_s = self._disarming
         delay_s = self.disarm_delay_s
-        is_automatic = False
-        if delay_s is not None and delay_s > 0.0:
-            is_automatic = abs(armed_for_s - delay_s) <= DISARM_DELAY_TOLERANCE_S
+        is_automatic = delay_s is not None and delay_s > 0.0 and abs(armed_for_s - delay_s) <= DISARM_DELAY_TOLERANCE_S
         return {
             "age_s": round(self._now() - at, 1),
             "armed_for_s": round(armed_for_s, 1),

@@ -147,7 +147,7 @@ async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Metadata | None = None) -> object:
     result = await vehicle.parameters.set(values["name"], values["value"])
-    return with_range_note(metadata, result, "serve --metadata FILE")
+    return with_range_note(metadata, result, metadata_option="serve --metadata FILE")
 
 
 def parameter_order(metadata: Metadata | None) -> OrderType:
@@ -159,7 +159,7 @@ def check_parameter(metadata: Metadata | None, values: Mapping[str, Any]) -> Non
     value = values["value"]
     # The library itself rejects values of other types, and values that MAVLink cannot represent.
     if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max and not values.get("force"):
-        check_values(metadata, {values["name"]: value}, '"force": true')
+        check_values(metadata, {values["name"]: value}, force_option='"force": true')
 
 
 async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
@@ -199,8 +199,8 @@ def _parse_plan_arguments(values: Mapping[str, Any]) -> ParsedArguments:
 
 
 _POSITION = {
-    "latitude_deg": OrderArgument("number", "degrees, WGS 84", True),
-    "longitude_deg": OrderArgument("number", "degrees, WGS 84", True),
+    "latitude_deg": OrderArgument("number", "degrees, WGS 84", is_required=True),
+    "longitude_deg": OrderArgument("number", "degrees, WGS 84", is_required=True),
     "altitude_relative_m": OrderArgument("number", "metres above home; without an altitude, the current one"),
     "altitude_amsl_m": OrderArgument("number", "metres above sea level, as an alternative"),
 }
@@ -209,8 +209,8 @@ _GO_TO = {
     "speed_m_s": OrderArgument("number", "metres per second"),
     "heading_deg": OrderArgument("number", "heading of the nose, clockwise from north"),
 }
-_ALTITUDE = {"altitude_m": OrderArgument("number", "metres above home, above 0, at most 10,000", True)}
-_MODE = {"mode": OrderArgument(("string", "integer"), "the autopilot's name or number of the mode", True)}
+_ALTITUDE = {"altitude_m": OrderArgument("number", "metres above home, above 0, at most 10,000", is_required=True)}
+_MODE = {"mode": OrderArgument(("string", "integer"), "the autopilot's name or number of the mode", is_required=True)}
 _DISARM = {
     "force": OrderArgument(
         "boolean", "true: also if the vehicle reports that it flies; refused unless it has a `crash` (false)"
@@ -218,14 +218,14 @@ _DISARM = {
 }
 _ITEM = {"item": OrderArgument("integer", "first item, counted from 0 (0)")}
 _VALUE = {
-    "value": OrderArgument("number", "finite", True),
+    "value": OrderArgument("number", "finite", is_required=True),
     "force": OrderArgument("boolean", "true: also set a value that the metadata does not allow (false)"),
 }
 _PLAN = {
     "plan": OrderArgument(
         ("object", "string"),
         "content of a QGroundControl .plan file; or the text of one, or of a QGC WPL 110 file",
-        True,
+        is_required=True,
     ),
     "name": OrderArgument("string", "name of the file, for the list of orders"),
 }

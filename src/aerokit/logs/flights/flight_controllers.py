@@ -102,7 +102,7 @@ class _RowReader(LogReader):
         if self._skipped:
             self.notes.append(skipped_rows_note(self._skipped))
 
-    def _note_time(self, unix_s: float) -> None:
+    def _note_missing_utc(self, unix_s: float) -> None:
         if unix_s < _A_YEAR_S and _NO_UTC not in self.notes:
             self.notes.append(_NO_UTC)
 
@@ -149,7 +149,7 @@ class BinReader(_RowReader):
             table, fields = message.get_type(), message.to_dict()
             fields.pop("mavpackettype", None)
             if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
-                self._note_time(message._timestamp)
+                self._note_missing_utc(message._timestamp)
                 states = _ardupilot_states(table, fields, reader)
                 yield LogRecord(
                     message._timestamp, system_id, component_id=1, table=table, fields=fields, states=states
@@ -263,7 +263,7 @@ class UlogReader(_RowReader):
             raise FileFormatError(f"{self.path} contains no data")
         self._topics = {_table_of(data): data for data in log.data_list}
         begins_s = utc_at_boot(log)
-        self._note_time(begins_s)
+        self._note_missing_utc(begins_s)
         system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         decoder = _Px4States()
         rows = heapq.merge(*(_rows(data) for data in log.data_list), _texts(log), key=_time_of)
@@ -328,7 +328,7 @@ class _Px4States:
             return _optional_state("position", _position(row["lat"], row["lon"], amsl_m, relative_m))
         elif table == "vehicle_attitude":
             quaternion = (row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"])
-            return (("attitude", Attitude.from_quaternion(*quaternion, (None, None, None))),)
+            return (("attitude", Attitude.from_quaternion(*quaternion, rates_deg_s=(None, None, None))),)
         elif table == "vehicle_local_position":
             north, east = (row["vx"], row["vy"]) if row.get("v_xy_valid", 1) else (math.nan, math.nan)
             return (("velocity", Velocity(north, east, row["vz"] if row.get("v_z_valid", 1) else math.nan)),)

@@ -157,7 +157,7 @@ class _Reader:
                     if step_s > 0:
                         paused_s += step_s
                     else:
-                        self._note_clock(-step_s, previous_unix_s - begins_at)
+                        self._note_clock_jump(-step_s, previous_unix_s - begins_at)
                         set_back_s -= step_s
                         unix_s = previous_unix_s
                 previous_unix_s = unix_s
@@ -208,7 +208,7 @@ class _Reader:
         self._damaged += 1
         return True
 
-    def _note_clock(self, set_back_s: float, time_s: float) -> None:
+    def _note_clock_jump(self, set_back_s: float, time_s: float) -> None:
         self._flight.notes.append(
             f"the recording's clock was set back by {set_back_s:.0f} s, {time_s:.0f} s after the log began: the times"
             " in this report continue without this jump"
@@ -265,8 +265,8 @@ class _Reader:
             m.Statustext: self._on_status_text,
             m.SysStatus: self._on_sys_status,
             m.BatteryStatus: self._on_battery_status,
-            m.GpsRawInt: lambda time_s, message: self._on_gps(time_s, message, 0),
-            m.Gps2Raw: lambda time_s, message: self._on_gps(time_s, message, 1),
+            m.GpsRawInt: lambda time_s, message: self._on_gps(time_s, message, number=0),
+            m.Gps2Raw: lambda time_s, message: self._on_gps(time_s, message, number=1),
             m.Vibration: self._on_vibration,
             m.EkfStatusReport: self._on_ekf_status_report,
             m.EstimatorStatus: self._on_estimator_status,
@@ -412,7 +412,7 @@ class _Reader:
     def _on_attitude_target(self, time_s: float, message: m.AttitudeTarget) -> None:
         if not message.type_mask & _NO_ATTITUDE and all(math.isfinite(part) for part in message.q):
             w, x, y, z = message.q
-            target = Attitude.from_quaternion(w, x, y, z, (None, None, None))
+            target = Attitude.from_quaternion(w, x, y, z, rates_deg_s=(None, None, None))
             self._flight.attitude_target.add(time_s, target.roll_deg, target.pitch_deg, target.yaw_deg)
 
     def _on_global_target(self, time_s: float, message: m.PositionTargetGlobalInt) -> None:

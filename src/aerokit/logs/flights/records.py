@@ -116,7 +116,7 @@ class TlogReader(LogReader):
                     yield LogRecord(unix_s, system_id, component_id, message.NAME, _NO_FIELDS, states, message)
                 framer.reset()  # the rest of a damaged message must not delay the next one
             on_bytes(file.tell())
-        self._check_and_note(count)
+        self._check_statistics(count)
 
     def _decode_parameter(self, message: Message, system_id: int, component_id: int) -> Message:
         """Decode the ``param_value`` of an autopilot's parameter. Return other messages unchanged."""
@@ -169,7 +169,7 @@ class TlogReader(LogReader):
             self._vehicles[system_id] = vehicle
         return vehicle.update(unix_s, message) if vehicle.component_id == component_id else ()
 
-    def _check_and_note(self, records: int) -> None:
+    def _check_statistics(self, records: int) -> None:
         if not records:
             raise FileFormatError(f"{self.path} contains no MAVLink messages: it is not a .tlog, or it is empty")
         statistics = self._framer.statistics

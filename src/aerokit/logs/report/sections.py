@@ -57,12 +57,8 @@ def _map(flight: FlightLog) -> Section:
 
 def _heights(flight: FlightLog) -> Section:
     relative = "altitude_relative_m"
-    chart = timeline(
-        flight,
-        "heights",
-        "metres above home",
-        [setpoint_trace(flight.position_target, relative), line_trace("actual", flight.track, relative)],
-    )
+    traces = [setpoint_trace(flight.position_target, relative), line_trace("actual", flight.track, relative)]
+    chart = timeline(flight, "heights", "metres above home", traces)
     explanation = "In all charts, background colours are modes, as in the map, and red lines are failsafes and falls."
     return _with_parts(Section("Height", explanation=explanation, missing="The log contains no heights."), chart)
 
@@ -205,15 +201,10 @@ def _estimator(flight: FlightLog) -> Section:
         " relative to the allowed one. Above 1 (the line) the estimator rejects the measurement.",
         missing="The log contains no estimator data.",
     )
+    ratios = [line_trace(name.replace("_", " "), flight.estimator, name) for name in flight.estimator]
     limit = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": 1, "y1": 1}
-    chart = timeline(
-        flight,
-        "estimator",
-        "ratio",
-        [line_trace(name.replace("_", " "), flight.estimator, name) for name in flight.estimator],
-        shapes=[{**limit, "line": {"color": "colour:failsafe", "width": 1}}],
-    )
-    return _with_parts(section, chart)
+    limit_line = {**limit, "line": {"color": "colour:failsafe", "width": 1}}
+    return _with_parts(section, timeline(flight, "estimator", "ratio", ratios, shapes=[limit_line]))
 
 
 def _fix_type_axis(flight: FlightLog) -> dict[str, Any]:
@@ -251,13 +242,8 @@ def _link(flight: FlightLog) -> Section:
     lost = timeline(flight, "lost", "% lost", [line_trace("lost", flight.link, "lost_percent", digits=1)], height=220)
     received = line_trace("received", flight.link, "received_hz", digits=0)
     rate = timeline(flight, "received", "messages per second", [received], height=180)
-    radio = timeline(
-        flight,
-        "radio",
-        "units of the radio",
-        [line_trace(name.replace("_", " "), flight.radio, name, digits=0) for name in flight.radio],
-        height=220,
-    )
+    radio_values = [line_trace(name.replace("_", " "), flight.radio, name, digits=0) for name in flight.radio]
+    radio = timeline(flight, "radio", "units of the radio", radio_values, height=220)
     silences = silence_sentences(flight)
     return _with_parts(section, Paragraphs(silences) if silences else None, lost, rate, radio)
 
