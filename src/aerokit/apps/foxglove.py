@@ -98,7 +98,7 @@ async def foxglove_bridge(
         raise InvalidArgument(f"port = {port} is not allowed: it must be 0 to 65535")
     message_types = _message_types(connection, messages)
     channels = _TopicChannels(connection)
-    server = _serve(channels, host, port)
+    server = _start_server(channels, host, port)
     tasks = BackgroundTasks(connection.fail)
     detachments = connection.attach(message_types, channels.on_message)
     try:
@@ -112,7 +112,7 @@ async def foxglove_bridge(
         for detach in detachments:
             detach()
         channels.close()
-        await _stop(server, host)
+        await _stop_server(server, host)
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
@@ -129,7 +129,7 @@ def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type
     return list(by_id.values())
 
 
-def _serve(channels: _TopicChannels, host: str, port: int) -> Any:
+def _start_server(channels: _TopicChannels, host: str, port: int) -> Any:
     try:
         return import_module("foxglove").start_server(
             name="aerokit",
@@ -143,7 +143,7 @@ def _serve(channels: _TopicChannels, host: str, port: int) -> Any:
         raise LinkOpenError(f"cannot listen for Foxglove on {host}, port {port}: {error}") from None
 
 
-async def _stop(server: Any, host: str) -> None:
+async def _stop_server(server: Any, host: str) -> None:
     """Stop the server, and wait until its socket is closed."""
     # The SDK's thread closes the socket only some time after `stop` has returned.
     port = server.port

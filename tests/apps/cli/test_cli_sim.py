@@ -20,7 +20,7 @@ from aerokit import connect
 from aerokit.apps.cli import main
 from aerokit.apps.cli.arguments import DEFAULT_SIM_ADDRESS, FAULTS, expand_address, fault, is_address_template
 from aerokit.apps.cli.main import make_parser
-from aerokit.apps.cli.sim import _client_address, _emit_addresses, _inject, simulated_fleet
+from aerokit.apps.cli.sim import _client_address, _emit_addresses, _inject_faults, simulated_fleet
 from aerokit.errors import AerokitError
 from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sim.faults import Faults
@@ -215,7 +215,7 @@ def test_sim_fault_begins_at_its_simulated_time() -> None:
     copters = [SimulatedCopter(), SimulatedCopter()]
 
     async def inject() -> list[bool]:
-        task = asyncio.create_task(_inject(copters, options))
+        task = asyncio.create_task(_inject_faults(copters, options))
         await anyio.sleep(9.9)
         early = any(copter.faults.gps_lost for copter in copters)
         await task

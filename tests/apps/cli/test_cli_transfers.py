@@ -361,7 +361,7 @@ def test_progress_bar_on_terminal_shows_percentage(
 ) -> None:
     threads = threading.active_count()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with progress_bar("flight.bin", "B") as show:
+    with progress_bar("flight.bin", unit="B") as show:
         show(TransferProgress(0, None, 0.0))
         show(TransferProgress(512 * 1024, 1024 * 1024, 1.0))
         show(TransferProgress(1024 * 1024, 1024 * 1024, 2.0))
@@ -370,6 +370,6 @@ def test_progress_bar_on_terminal_shows_percentage(
 
 
 def test_progress_bar_without_terminal_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar("flight.bin", "B") as show:
+    with progress_bar("flight.bin", unit="B") as show:
         show(TransferProgress(512, 1024, 1.0))
     assert capsys.readouterr().err == ""

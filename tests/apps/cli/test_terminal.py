@@ -93,7 +93,7 @@ def test_stopped_terminal_delays_warnings_and_progress_bars(monkeypatch: pytest.
         with plain_warnings(), nonblocking_stderr():
             warnings.simplefilter("always")
             warnings.warn("one", ParameterRenamedWarning, stacklevel=1)
-            with asking.progress_bar("two", "B") as show:
+            with asking.progress_bar("two", unit="B") as show:
                 show(TransferProgress(10, 10, 1.0))
             termios.tcflow(theirs, termios.TCOON)
             emit(argparse.Namespace(json=False), "line", {}, None)

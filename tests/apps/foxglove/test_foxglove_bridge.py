@@ -210,7 +210,7 @@ async def test_after_block_slow_server_has_closed_port(
         def stop(self) -> None:
             threading.Timer(0.2, self.listening.close).start()
 
-    monkeypatch.setattr(bridge_module, "_serve", SlowServer)
+    monkeypatch.setattr(bridge_module, "_start_server", SlowServer)
     async with bridged() as (bridge, _):
         assert not await is_port_free("127.0.0.1", bridge.port)
     with pytest.raises(OSError, match=r"111|refused|Connect"):

@@ -47,7 +47,7 @@ def ftp(opcode: int, **fields: Any) -> m.FileTransferProtocol:
 def recorded(messages: list[m.FileTransferProtocol]) -> list[tuple[int, int]]:
     mission = RecordedMission(1)
     for message in messages:
-        mission.add(0.0, message)
+        mission.on_message(0.0, message)
     return [(item.number, item.command) for item in mission.waypoints]
 
 

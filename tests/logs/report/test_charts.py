@@ -19,12 +19,12 @@ from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPla
 from aerokit.logs.report import report_html
 from aerokit.logs.report.charts import (
     COLOURS,
-    drawn_track,
     line_trace,
     mode_colours,
     timeline,
     timeline_shapes,
     track_parts,
+    track_rows_to_draw,
 )
 from aerokit.logs.report.page import MAX_OPEN_ROWS, MAX_PRINTED_ROWS, Chart, Paragraphs, Section, Table, page
 from aerokit.logs.report.sections import SECTIONS
@@ -128,7 +128,7 @@ def test_square_flown_619_times_stays_square(changes: int, tmp_path: Path) -> No
     assert isinstance(note, Paragraphs)
     stated = float(note.lines[0].split(" more than ")[1].split(" m ")[0])
     assert stated < 0.3
-    rows, deviation = drawn_track(square(LAPS))
+    rows, deviation = track_rows_to_draw(square(LAPS))
     assert largest_distance(square(LAPS), rows) <= deviation == pytest.approx(stated, abs=0.05)
     assert 4 * LAPS < len(rows) < 7000
 

@@ -75,7 +75,7 @@ async def _get(options: argparse.Namespace) -> int:
     target = _destination(options)
     check_not_existing(target, options)
     async with connected(options) as vehicle:
-        with progress_bar(target.name, "B") as on_progress:
+        with progress_bar(target.name, unit="B") as on_progress:
             await vehicle.files.download(
                 options.path, target, resume=True, idle_timeout_s=options.patience, on_progress=on_progress
             )
@@ -93,7 +93,7 @@ def _destination(options: argparse.Namespace) -> Path:
 async def _put(options: argparse.Namespace) -> int:
     size = _size(options.file)
     async with connected(options, changes_vehicle=True) as vehicle:
-        with progress_bar(Path(options.file).name, "B") as on_progress:
+        with progress_bar(Path(options.file).name, unit="B") as on_progress:
             await vehicle.files.upload(
                 options.file, options.path, idle_timeout_s=options.patience, on_progress=on_progress
             )
@@ -144,7 +144,7 @@ async def _get_logs(options: argparse.Namespace) -> int:
             # The vehicle counts from 1 again after its logs were erased, so the file may be of another flight.
             if target.exists() and (kept := keep_existing(target)) is not None:
                 print(f"aerokit: {target} existed and was kept as {kept}", file=sys.stderr)
-            with progress_bar(target.name, "B") as on_progress:
+            with progress_bar(target.name, unit="B") as on_progress:
                 await vehicle.logs.download(
                     entry, target, method=options.method, idle_timeout_s=options.patience, on_progress=on_progress
                 )

@@ -55,7 +55,7 @@ async def _convert(options: argparse.Namespace) -> int:
     is_empty_folder = options.out.is_dir() and not any(options.out.iterdir())
     if not is_empty_folder:
         check_not_existing(options.out, options)
-    with progress_bar(options.log.name, "B") as on_progress:
+    with progress_bar(options.log.name, unit="B") as on_progress:
         result = convert(options.log, options.out, tables=options.tables, force=options.force, on_progress=on_progress)
     for note in result.notes:
         print(printable(f"aerokit: {options.log}: {note}"), file=sys.stderr)
@@ -108,7 +108,7 @@ async def _report(options: argparse.Namespace) -> int:
     for log in logs:
         check_log_name(log)
     check_not_existing(target, options)
-    with progress_bar(options.log.name, "B") as on_progress:
+    with progress_bar(options.log.name, unit="B") as on_progress:
         report = write_report(
             options.log,
             target,

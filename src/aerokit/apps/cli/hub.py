@@ -125,8 +125,8 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
     from aerokit.hub import Endpoint
 
     names = [name for name, _ in options.endpoints]
-    in_filters = [name for name, _ in (*options.only, *options.block, *options.rate) if name]  # "" means all endpoints
-    for name in (*options.read_only, *options.patient, *options.signed, *in_filters):
+    filter_names = [name for name, _ in (*options.only, *options.block, *options.rate) if name]  # "" means all
+    for name in (*options.read_only, *options.patient, *options.signed, *filter_names):
         if name not in names:
             hint = suggestion(name, names)
             raise InvalidArgument(f"no endpoint is named {name!r}{hint}; endpoints: {', '.join(names)}")

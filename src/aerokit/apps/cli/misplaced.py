@@ -57,7 +57,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     has_address_argument = any("address" in action.dest or action.dest == "endpoints" for action in parser._actions)
     if has_address_argument and not takes_connect:
         return _superfluous_connect(parser, words)
-    takes_vehicle_paths = command[1:2] == ["files"]
+    takes_vehicle_paths = "files" in command
     for index, word in enumerate(words):
         # A path on the vehicle may begin with /dev, like the address of a serial port.
         is_path = takes_vehicle_paths and word.startswith("/")

@@ -202,7 +202,7 @@ async def _load(options: argparse.Namespace) -> int:
             differences = await vehicle.parameters.diff(file_values, idle_timeout_s=options.patience)
             new_values = {change.name: change.after for change in differences if change.after is not None}
             check_allowed(metadata, new_values)
-        with progress_bar("parameters", "parameter") as on_progress:
+        with progress_bar("parameters", unit="parameter") as on_progress:
             results = await vehicle.parameters.upload(
                 file_values, idle_timeout_s=options.patience, on_progress=on_progress
             )
@@ -242,7 +242,7 @@ def _check_file(file_values: ParameterFile, table: ParameterTable, vehicle: Vehi
 
 
 async def _download(vehicle: Vehicle, options: argparse.Namespace) -> ParameterTable:
-    with progress_bar("parameters", "parameter") as on_progress:
+    with progress_bar("parameters", unit="parameter") as on_progress:
         return await vehicle.parameters.download(idle_timeout_s=options.patience, on_progress=on_progress)
 
 

@@ -252,14 +252,14 @@ async def run_sim(options: argparse.Namespace) -> int:
 
 @asynccontextmanager
 async def injecting_faults(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> AsyncIterator[None]:
-    injecting = asyncio.create_task(_inject(vehicles, options))
+    injecting = asyncio.create_task(_inject_faults(vehicles, options))
     try:
         yield
     finally:
         injecting.cancel()
 
 
-async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:
+async def _inject_faults(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:
     loop = asyncio.get_running_loop()
     started_at = loop.time()
     for name, value, at_s in sorted(options.faults, key=lambda fault: fault.at_s):

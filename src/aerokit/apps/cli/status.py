@@ -274,8 +274,7 @@ def _emit_link(connection: Connection, options: argparse.Namespace, seconds: flo
 
 
 def _emit_components(connection: Connection, options: argparse.Namespace, vehicles: dict[int, Vehicle]) -> None:
-    for source, heartbeat in sorted(connection.heartbeats.items()):
-        system_id, component_id = source
+    for (system_id, component_id), heartbeat in sorted(connection.heartbeats.items()):
         if system_id in vehicles and vehicles[system_id].component_id == component_id:
             continue
         record, text = _component_record_and_text(heartbeat, system_id, component_id)

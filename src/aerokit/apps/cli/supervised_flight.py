@@ -177,7 +177,7 @@ class SupervisedFlight(ABC):
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
             return DONE
-        if not self._check_control():
+        if not self._still_has_control():
             return DONE
         if self._is_armed_on_ground and action != "nothing":
             try:
@@ -185,7 +185,7 @@ class SupervisedFlight(ABC):
             except (OperationRejected, CommandTimeout) as error:
                 # The vehicle may have taken off after it reported its landed state.
                 self._print(f"disarming failed: {plain_text(error)}")
-            if vehicle.is_confirmed_disarmed or not self._check_control():
+            if vehicle.is_confirmed_disarmed or not self._still_has_control():
                 return DONE
             # Disarming has failed, so the vehicle gets the command for a flying vehicle.
         text = INTERRUPT_ACTIONS[action]
@@ -199,7 +199,7 @@ class SupervisedFlight(ABC):
                 await vehicle.hold()
         except CommandRejected as error:
             # For example, autopilots refuse to return without a position. The vehicle is then held instead.
-            if action == "hold" or not self._check_control():
+            if action == "hold" or not self._still_has_control():
                 raise
             self._print(f"{text} failed: {plain_text(error)}; {INTERRUPT_ACTIONS['hold']} instead")
             await vehicle.hold()
@@ -231,7 +231,7 @@ class SupervisedFlight(ABC):
         await self._vehicle.disarm()
         self._print("disarmed")
 
-    def _check_control(self) -> bool:
+    def _still_has_control(self) -> bool:
         """Return True if this program still has control. Otherwise, print why no command is sent."""
         if not self._is_in_our_mode:
             self._print(
@@ -351,8 +351,8 @@ class FlightReport:
             f" flown {self._flown_m:.0f} m, max height {self._highest_m:.1f} m,"
             f" max ground speed {self._fastest_m_s:.1f} m/s",
             *(
-                f"battery {battery.id + 1}: {_number(battery.voltage_v, 'V')},"
-                f" {_number(battery.remaining_percent, '%')} left"
+                f"battery {battery.id + 1}: {_number_text(battery.voltage_v, 'V')},"
+                f" {_number_text(battery.remaining_percent, '%')} left"
                 for battery in batteries
             ),
         ]
@@ -373,13 +373,13 @@ class FlightReport:
         """
         notes = []
         if self._impact_s is not None:
-            notes.append(f"{_duration(speed * self._impact_s)} until the impact")
+            notes.append(f"{_duration_text(speed * self._impact_s)} until the impact")
         if self.speedup != 1.0:
-            notes.append(f"simulated in {_duration(self._armed_s)}, {speed:g}x")
+            notes.append(f"simulated in {_duration_text(self._armed_s)}, {speed:g}x")
         elif speed != 1.0:
             factor = f"{round(speed, 1):g}"
-            notes.append(f"a simulation at {factor} times real speed: {_duration(self._armed_s)} on this clock")
-        return f"armed for {_duration(speed * self._armed_s)}" + (f" ({'; '.join(notes)})" if notes else "")
+            notes.append(f"a simulation at {factor} times real speed: {_duration_text(self._armed_s)} on this clock")
+        return f"armed for {_duration_text(speed * self._armed_s)}" + (f" ({'; '.join(notes)})" if notes else "")
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
         self._add_armed_time()
@@ -467,10 +467,10 @@ class FlightReport:
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - used until the process ends
 
 
-def _duration(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     minutes, remaining_s = divmod(round(seconds), 60)
     return f"{minutes} min {remaining_s:02} s" if minutes else f"{remaining_s} s"
 
 
-def _number(value: float | None, unit: str) -> str:
+def _number_text(value: float | None, unit: str) -> str:
     return "unknown" if value is None else f"{value:.4g} {unit}"

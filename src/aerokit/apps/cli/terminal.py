@@ -188,7 +188,7 @@ class _Bar(tqdm):  # type: ignore[misc]  # tqdm has no annotations
 
 
 @contextmanager
-def progress_bar(what: str, unit: str | None) -> Iterator[OnProgress]:
+def progress_bar(what: str, *, unit: str | None) -> Iterator[OnProgress]:
     """Show a progress bar within the block, and yield the ``on_progress`` callback.
 
     ``unit`` is ``"B"`` for bytes or a singular noun. With None, the bar shows only a percentage.

@@ -312,16 +312,13 @@ class Monitor(App[None]):
     def _state_content(self) -> list[tuple[str, Text]] | Text:
         vehicle = self.selected
         if vehicle is not None:
-            return VehicleText(vehicle).rows(more=self._is_wide, size=self._state_size())
+            size = self.screen_stack[0].query_one("#state", Panel).content_size
+            return VehicleText(vehicle).rows(more=self._is_wide, size=(size.width, size.height))
         waited_s = self._model.connection.now() - self._began_at
         return Text(
             f"waiting for a vehicle's heartbeat on {self._name} ({waited_s:.0f} s)\n\n"
             f"{explain_no_vehicle(self._model.connection, wanted_system=None)}"
         )
-
-    def _state_size(self) -> tuple[int, int]:
-        size = self.screen_stack[0].query_one("#state", Panel).content_size
-        return size.width, size.height
 
     def _show_map(self, widget: Panel) -> None:
         model = self._model

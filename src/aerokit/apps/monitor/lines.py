@@ -312,6 +312,7 @@ class Canvas:
         self._marks: dict[tuple[int, int], tuple[str, str]] = {}
 
     def line(self, points: Sequence[tuple[float, float]], style: str) -> None:
+        """Draw lines between consecutive points, in metres north and east."""
         dots = [self._dot_at(point) for point in points]
         ends = dots[1:] or dots  # a single point is a line to itself
         for (x, y), (end_x, end_y) in zip(dots, ends, strict=False):

@@ -55,8 +55,8 @@ def document() -> dict[str, Any]:
     states = {}
     for name, (_, text) in documentation().items():
         (value_type,) = typing.get_args(cell_types[name])
-        states[name] = _message(name, text, _enum_schema(name) or _schema_of(value_type, definitions))
-    states["link"] = _message("link", "State and statistics of the link to the vehicle.", _LINK)
+        states[name] = _message_schema(name, text, _enum_schema(name) or _schema_of(value_type, definitions))
+    states["link"] = _message_schema("link", "State and statistics of the link to the vehicle.", _LINK)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "aerokit state",
@@ -93,7 +93,7 @@ _MESSAGE: dict[str, Any] = {
 }
 
 
-def _message(name: str, text: str, value: dict[str, Any]) -> dict[str, Any]:
+def _message_schema(name: str, text: str, value: dict[str, Any]) -> dict[str, Any]:
     return {
         "title": name,
         "description": " ".join(text.replace("`", "").split()),

@@ -119,7 +119,7 @@ async def discover(
         all_names = KeySpace(fleet, "*").server_token()
         subscribers.append(session.liveliness().declare_subscriber(all_names, on_sample, history=True))
 
-    options = NetworkOptions(tuple(connect), tuple(listen), "", config)
+    options = NetworkOptions(tuple(connect), tuple(listen), config=config)
     session = await open_session(f"zenoh://{fleet}", options, subscribe)
     try:
         await anyio.sleep(wait)

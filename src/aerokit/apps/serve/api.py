@@ -163,7 +163,7 @@ def _operation(operation: Operation) -> dict[str, Any]:
         "summary": operation.summary,
         "parameters": [*_parameters(operation)],
         "responses": {
-            "200": {"description": "done" if is_order else "the current values", "content": _json(answer)},
+            "200": {"description": "done" if is_order else "the current values", "content": _json_content(answer)},
             **_failures(operation),
         },
     }
@@ -171,12 +171,12 @@ def _operation(operation: Operation) -> dict[str, Any]:
         # In OpenAPI, {} means that a request without a token may be allowed, too.
         description["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
     if is_order:
-        description["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}
+        description["responses"]["202"] = {"description": "running (wait=false)", "content": _json_content(answer)}
     order_type = operation.order or operation.body_type
     if order_type is not None:
         description["requestBody"] = {
             "required": any(argument.is_required for argument in order_type.arguments.values()),
-            "content": _json(_body(order_type)),
+            "content": _json_content(_body_schema(order_type)),
         }
     return description
 
@@ -213,22 +213,22 @@ def _failures(operation: Operation) -> dict[str, Any]:
     }
 
 
-def _body(order_type: OrderType) -> dict[str, Any]:
+def _body_schema(order_type: OrderType) -> dict[str, Any]:
     arguments = order_type.arguments
     return {
         "type": "object",
-        "properties": {name: _schema(argument) for name, argument in arguments.items()},
+        "properties": {name: _argument_schema(argument) for name, argument in arguments.items()},
         "required": [name for name, argument in arguments.items() if argument.is_required],
         "additionalProperties": False,
     }
 
 
-def _schema(argument: OrderArgument) -> dict[str, Any]:
+def _argument_schema(argument: OrderArgument) -> dict[str, Any]:
     json_type = argument.type if isinstance(argument.type, str) else list(argument.type)
     return {"type": json_type, "description": argument.text}
 
 
-def _json(schema: dict[str, Any]) -> dict[str, Any]:
+def _json_content(schema: dict[str, Any]) -> dict[str, Any]:
     return {"application/json": {"schema": schema}}
 
 

@@ -139,7 +139,7 @@ class SecurityMiddleware:
             await send(message)
 
         try:
-            self._check(Headers(scope=scope))
+            self._check_host_and_origin(Headers(scope=scope))
         except HttpProblem as problem:
             if scope["type"] == "websocket":
                 await receive()  # websocket.connect, which ASGI requires to be received before an answer
@@ -149,7 +149,7 @@ class SecurityMiddleware:
             return
         await self._app(scope, receive, send_with_headers)
 
-    def _check(self, headers: Headers) -> None:
+    def _check_host_and_origin(self, headers: Headers) -> None:
         """Raise HttpProblem if the request is for another host, or comes from a page of another site."""
         host = headers.get("host", "")
         if not self._is_own_host(host):
@@ -181,7 +181,7 @@ def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
     A connection is anonymous until one of its requests has the token. If there are too many anonymous connections, one
     of them is closed.
     """
-    anonymous: dict[_HttpConnection, None] = {}
+    anonymous: dict[_HttpConnection, None] = {}  # an ordered set, the oldest connection first
 
     class HttpConnection(_HttpConnection):
         _anonymous = anonymous

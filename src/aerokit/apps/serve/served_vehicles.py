@@ -180,11 +180,11 @@ class ServedVehicles:
             is_about_link_or_vehicle = event.system_id == 0 or event.system_id in self._vehicles
             if isinstance(event, LinkReport) or not is_about_link_or_vehicle:
                 return
-            self._record(event, connection.unix_time() - (connection.now() - event.at))
+            self._record_event(event, connection.unix_time() - (connection.now() - event.at))
 
         self._attached[connection] = connection.attach([Event], on_event)
 
-    def _record(self, event: Event, unix_s: float) -> None:
+    def _record_event(self, event: Event, unix_s: float) -> None:
         if isinstance(event, StatusTextReceived):
             texts = self._texts.setdefault(event.system_id, deque(maxlen=MAX_TEXTS))
             texts.append({"time_unix_s": unix_s, "severity": event.severity, "text": event.text})

@@ -80,7 +80,7 @@ class _TrackWriter:
         for system_id in {record.system_id, message.target_system}:
             if system_id not in self._missions:
                 self._missions[system_id] = RecordedMission(system_id)
-            self._missions[system_id].add(record.unix_s, message)
+            self._missions[system_id].on_message(record.unix_s, message)
 
     def _waypoints(self, system_id: int) -> list[Waypoint]:
         if system_id not in self._missions:

@@ -373,10 +373,10 @@ def _attitude_context(flight: FlightLog, time_s: float) -> list[str]:
 
 def _offboard_context(flight: FlightLog, time_s: float) -> list[str]:
     ages = []
-    for columns in (flight.position_target, flight.velocity_target):
-        last_row = columns.index_at(time_s)
+    for setpoints in (flight.position_target, flight.velocity_target):
+        last_row = setpoints.index_at(time_s)
         if last_row >= 0:
-            ages.append(time_s - columns.times[last_row])
+            ages.append(time_s - setpoints.times[last_row])
     return [f"last logged set-point {min(ages):.1f} s before"] if ages else []
 
 
@@ -401,8 +401,8 @@ _CONTEXTS: dict[str, Callable[[FlightLog, float], list[str]]] = {
 }
 
 
-def _max_before(columns: TimeSeries, name: str, time_s: float) -> float | None:
-    values = columns.between(name, time_s - _BEFORE_S, time_s)
+def _max_before(series: TimeSeries, name: str, time_s: float) -> float | None:
+    values = series.between(name, time_s - _BEFORE_S, time_s)
     return max(values) if len(values) else None
 
 

@@ -129,23 +129,25 @@ class _Tables:
         data, offsets = reader.data_map, reader.offsets[row_format.type]
         last_offset = len(data) - row_format.len  # a row after this offset is cut off by the end of the file
         for begin in range(0, len(offsets), _CHUNK_ROWS):
-            rows = [
-                unpack(data, offset + _HEADER_SIZE)
-                for offset in offsets[begin : begin + _CHUNK_ROWS]
-                if offset <= last_offset
-            ]
+            chunk_offsets = offsets[begin : begin + _CHUNK_ROWS]
+            rows = [unpack(data, offset + _HEADER_SIZE) for offset in chunk_offsets if offset <= last_offset]
             if not rows:
                 continue
             unpacked = list(zip(*rows, strict=True))
             chunk = [_scaled(unpacked[position], scale) for position, scale in zip(positions, scales, strict=True)]
             times_us, *values = chunk
             times = [(time_us - self.began_us) / 1e6 for time_us in times_us]
-            increases = all(map(operator.le, times, times[1:]))
-            if not increases or times[-1] > self._max_s:
-                kept = [self._is_plausible(times, row) for row in range(len(times))]
-                self.damaged.update(offsets[begin + row] for row, is_kept in enumerate(kept) if not is_kept)
-                times, *values = (list(compress(column, kept)) for column in (times, *values))
-            yield [times, *values]
+            yield self._without_damaged_rows([times, *values], chunk_offsets)
+
+    def _without_damaged_rows(self, times_and_columns: list[list[Any]], offsets: Sequence[int]) -> list[list[Any]]:
+        """Drop rows whose time is not plausible, and record their offsets."""
+        times = times_and_columns[0]
+        increases = all(map(operator.le, times, times[1:]))
+        if increases and times[-1] <= self._max_s:
+            return times_and_columns
+        kept = [self._is_plausible(times, row) for row in range(len(times))]
+        self.damaged.update(offset for offset, is_kept in zip(offsets, kept, strict=False) if not is_kept)
+        return [list(compress(column, kept)) for column in times_and_columns]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
         # Rows have no checksum, so a time may be damaged. In a `TimeSeries`, no later row could have an earlier time.

@@ -121,7 +121,7 @@ class _Reader:
             m.SetMode: self._mode_commands.on_set_mode,
         }
         handlers: dict[type[Message], Callable[[float, Any], None]] = {
-            **dict.fromkeys(RecordedMission.MESSAGES, self._mission.add),
+            **dict.fromkeys(RecordedMission.MESSAGES, self._mission.on_message),
             # Telemetry radios insert these with ids of their own.
             m.RadioStatus: self._on_radio,
             m.Radio: self._on_radio,
@@ -189,7 +189,7 @@ class _Reader:
                     if message_id == _HEARTBEAT_ID:
                         self._record_other_heartbeat(unix_s - begins_at, sender[0], raw)
                     continue
-                message = _decoded(raw, unix_s)
+                message = _decode_frame(raw, unix_s)
                 if message is None:
                     self._damaged += 1
                 else:
@@ -512,7 +512,7 @@ def _message_id_bytes(kind: type[Message]) -> bytes:
     return kind.ID.to_bytes(3, "little")
 
 
-def _decoded(raw: bytes, unix_s: float) -> Message | None:
+def _decode_frame(raw: bytes, unix_s: float) -> Message | None:
     """Decode the frame of a record; None if its checksum is wrong."""
     if raw[0] == MAGIC_V2:
         # Setting the attributes is faster than `Frame.parse`. A signature after the checksum is ignored.

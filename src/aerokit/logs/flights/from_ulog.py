@@ -295,7 +295,7 @@ class _Reader:
                 if fix_type >= GpsFixType.TYPE_3D_FIX:
                     self._flight.track.add(time_s, latitude / per_degree, longitude / per_degree, amsl / per_metre, NAN)
 
-    def _add_angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:
+    def _add_angles(self, series: TimeSeries, topic: _Topic | None, field: str) -> None:
         """Add the roll, pitch and yaw angles of the quaternions in a field."""
         if topic is None or f"{field}[0]" not in topic:
             return
@@ -305,7 +305,7 @@ class _Reader:
         pitch = numpy.arcsin(numpy.clip(2 * (w * y - z * x), -1, 1))
         yaw = numpy.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         angles = {"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
-        _extend(columns, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
+        _extend(series, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
 
     def _read_targets(self) -> None:
         flight = self._flight
@@ -410,6 +410,7 @@ def _drop_damaged_rows(topics: list[Any]) -> int:
     """Drop rows with an impossible time, and topics that are then empty. Return the number of these rows."""
     numpy = import_module("numpy")
     all_times = [topic.data["timestamp"].astype("int64") for topic in topics]
+    # The last row of a topic may itself be damaged.
     last_us = max((int(times[-2]) for times in all_times if len(times) > 1), default=_MAX_TIME_US)
     damaged = 0
     for topic, times in zip(topics, all_times, strict=True):
@@ -426,8 +427,8 @@ def _drop_damaged_rows(topics: list[Any]) -> int:
     return damaged
 
 
-def _extend(columns: TimeSeries, times: Sequence[float], **values: Any) -> None:
-    columns.extend(times, **{name: array("d", value.astype("float64").tobytes()) for name, value in values.items()})
+def _extend(series: TimeSeries, times: Sequence[float], **values: Any) -> None:
+    series.extend(times, **{name: array("d", value.astype("float64").tobytes()) for name, value in values.items()})
 
 
 def _version(log: Any) -> str:

@@ -128,12 +128,12 @@ class TlogReader(LogReader):
         elif isinstance(message, AutopilotVersion):
             self._capabilities[system_id, component_id] = message.capabilities
         elif isinstance(message, ParamValue):
-            return self._decoded(message, system_id, component_id)
+            return self._with_decoded_value(message, system_id, component_id)
         elif isinstance(message, ParamSet):
-            return self._decoded(message, message.target_system, message.target_component)
+            return self._with_decoded_value(message, message.target_system, message.target_component)
         return message
 
-    def _decoded(self, message: ParamValue | ParamSet, system_id: int, component_id: int) -> Message:
+    def _with_decoded_value(self, message: ParamValue | ParamSet, system_id: int, component_id: int) -> Message:
         autopilot_id, autopilot = self._autopilots.get(system_id, (0, None))
         # Other components' values stay as they were sent, because their encoding is unknown.
         if autopilot is None or component_id not in (0, autopilot_id):  # 0 means all components

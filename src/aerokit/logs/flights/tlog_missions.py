@@ -44,7 +44,7 @@ class RecordedMission:
     def waypoints(self) -> list[Waypoint]:
         return [self._items[number] for number in sorted(self._items)]
 
-    def add(self, _time_s: float, message: MissionMessage) -> None:
+    def on_message(self, _time_s: float, message: MissionMessage) -> None:
         sender = None if message.received_frame is None else message.received_frame.system_id
         if self._system_id not in (sender, message.target_system):
             return
@@ -65,7 +65,7 @@ class RecordedMission:
             # Items beyond this number belong to an earlier mission.
             self._items = {number: item for number, item in self._items.items() if number < message.count}
         elif message.current not in _NO_MISSION_ITEM:
-            self._add(message)
+            self._store_item(message)
 
     def _on_file_transfer(self, message: m.FileTransferProtocol) -> None:
         """Collect the blocks of ArduPilot's mission file while it is uploaded or downloaded."""
@@ -99,9 +99,9 @@ class RecordedMission:
         if not header.options & NO_CLEAR:
             self._items.clear()
         for number, item in enumerate(items, header.first_index):
-            self._add(to_wire(item, number, target_system=0, target_component=0))
+            self._store_item(to_wire(item, number, target_system=0, target_component=0))
 
-    def _add(self, message: m.MissionItemInt | m.MissionItem) -> None:
+    def _store_item(self, message: m.MissionItemInt | m.MissionItem) -> None:
         scale = _DEGREES_E7 if isinstance(message, m.MissionItemInt) else 1.0
         # In other frames, x and y are no degrees. Commands without a place use them for parameters 5 and 6.
         has_position = message.frame in GLOBAL_FRAMES and has_place(message.command) and (message.x or message.y)

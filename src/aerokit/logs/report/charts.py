@@ -185,9 +185,9 @@ def track_parts(flight: FlightLog) -> list[Part]:
     plane = TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg)
     lines, deviation_m = _track_lines(flight, places)
     traces = [
-        *_setpoint_path(flight, plane),
-        *_mission(flight, plane),
-        *_circular_fence(flight),
+        *_setpoint_traces(flight, plane),
+        *_mission_traces(flight, plane),
+        *_fence_traces(flight),
         *lines,
         _marker("home", [(0.0, 0.0)], symbol="circle", colour="colour:home", size=11),
         *_failsafe_markers(flight, places),
@@ -203,7 +203,7 @@ def simplification_note(deviation_m: float) -> list[Part]:
     return [Paragraphs([f"The line is simplified: no recorded position is more than {deviation_m:.2f} m from it."])]
 
 
-def drawn_track(
+def track_rows_to_draw(
     places: Sequence[tuple[float, float]], max_rows: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
     """Return the indices of the places to draw, and the largest distance of a place from the drawn line.
@@ -211,7 +211,7 @@ def drawn_track(
     Places in ``keep`` are always drawn. If all places are NaN, nothing is drawn.
     """
     if len(places) <= MAX_POINTS:  # short lines are drawn completely
-        has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
+        has_known = any(None not in map(rounded_or_none, place) for place in places)
         rows = list(range(len(places))) if has_known else []
         return rows, 0.0
     rows, deviation_m = simplify(places, max_rows, _TRACK_TOLERANCE_M, keep)
@@ -242,7 +242,7 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     changes = flight.modes or [ModeChange(0.0, "")]
     # The rows at which the modes begin, and the end of the last mode.
     boundaries = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
-    rows, deviation_m = drawn_track(places, keep=(row for row in boundaries if row < len(places)))
+    rows, deviation_m = track_rows_to_draw(places, keep=(row for row in boundaries if row < len(places)))
     rows_by_mode: dict[str, list[int | None]] = {}  # None interrupts the line
     for (start, end), change in zip(pairwise(boundaries), changes, strict=True):
         # The line of a mode ends at the first position of the next mode, so that the track has no gaps.
@@ -256,7 +256,7 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     colours = mode_colours(flight)
     lines = [
         {
-            **_coordinates(None if row is None else places[row] for row in mode_rows),
+            **coordinates(None if row is None else places[row] for row in mode_rows),
             "text": ["" if row is None else _hover_text(times[row], heights[row]) for row in mode_rows],
             "mode": "lines",
             "name": name or "track",
@@ -268,22 +268,22 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     return lines, deviation_m
 
 
-def _coordinates(places: Iterable[tuple[float, float] | None]) -> dict[str, list[float | None]]:
+def coordinates(places: Iterable[tuple[float, float] | None]) -> dict[str, list[float | None]]:
     """Convert pairs of metres north and east to Plotly's x and y. None interrupts the line."""
     pairs = [(math.nan, math.nan) if place is None else place for place in places]
-    return {"x": [rounded(east) for _, east in pairs], "y": [rounded(north) for north, _ in pairs]}
+    return {"x": [rounded_or_none(east) for _, east in pairs], "y": [rounded_or_none(north) for north, _ in pairs]}
 
 
 def _hover_text(time_s: float, height_m: float) -> str:
     return clock_text(time_s) if math.isnan(height_m) else f"{clock_text(time_s)}, {height_m:.1f} m up"
 
 
-def rounded(value: float) -> float | None:
+def rounded_or_none(value: float) -> float | None:
     """Round a coordinate for drawing; None if it is unknown or damaged."""
     return round(value, 2) if abs(value) <= MAX_COORDINATE else None
 
 
-def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
+def _setpoint_traces(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
     target = flight.position_target
     places = [
         plane.metres(latitude, longitude)
@@ -292,10 +292,10 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
     ]
     if not places:
         return []
-    rows, _ = drawn_track(places, MAX_TRACK_POINTS // 2)
+    rows, _ = track_rows_to_draw(places, max_rows=MAX_TRACK_POINTS // 2)
     return [
         {
-            **_coordinates(places[row] for row in rows),
+            **coordinates(places[row] for row in rows),
             "mode": "lines",
             "name": "set-point",
             "line": {"color": _SETPOINT, "width": 1.5, "dash": "dot"},
@@ -304,7 +304,7 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
     ]
 
 
-def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
+def _mission_traces(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
     items = [item for item in flight.mission if not math.isnan(item.latitude_deg) and flight.item_label(item) != "home"]
     if not items:
         return []
@@ -319,7 +319,7 @@ def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
     return [{**markers, "mode": "markers+lines", "line": {"color": "colour:mission", "width": 1, "dash": "dash"}}]
 
 
-def _circular_fence(flight: FlightLog) -> list[dict[str, Any]]:
+def _fence_traces(flight: FlightLog) -> list[dict[str, Any]]:
     # Fences of polygons are not in the logs.
     end_s, parameter_at = flight.duration_s, flight.parameter_at
     radius = parameter_at("GF_MAX_HOR_DIST", end_s)  # PX4
@@ -363,7 +363,7 @@ def _marker(
     name: str, places: Sequence[tuple[float, float]], *, symbol: str, colour: str, size: int, texts: Sequence[str] = ()
 ) -> dict[str, Any]:
     return {
-        **_coordinates(places),
+        **coordinates(places),
         "mode": "markers",
         "name": name,
         "text": list(texts) or [name] * len(places),

@@ -7,13 +7,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.report.charts import (
+    coordinates,
     drawn_points,
-    drawn_track,
     map_layout,
-    rounded,
     series_colour,
     simplification_note,
     time_range,
+    track_rows_to_draw,
 )
 from aerokit.logs.report.page import Chart, Paragraphs, Section, Table
 from aerokit.logs.report.sections import failsafe_section, mode_table
@@ -90,13 +90,10 @@ def _maps(flights: Sequence[FlightLog]) -> Section:
     deviations: list[float] = []
     for number, flight in enumerate(flights):
         places = metres_from_home(flight)
-        rows, deviation_m = drawn_track(places)
+        rows, deviation_m = track_rows_to_draw(places)
         deviations.append(deviation_m)
         if rows:
-            drawn_places = [places[row] for row in rows]
-            north = [rounded(north_m) for north_m, _ in drawn_places]
-            east = [rounded(east_m) for _, east_m in drawn_places]
-            traces.append({"x": east, "y": north, **_line_style(number)})
+            traces.append({**coordinates(places[row] for row in rows), **_line_style(number)})
     if not traces:
         return Section("Tracks", missing="Neither log has positions.")
     chart = Chart("maps", traces, map_layout(traces), height=520, label="tracks from above, north is up")

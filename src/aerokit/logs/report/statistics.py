@@ -132,24 +132,24 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
     return FlightStatistics(
         armed_s=sum(end - begin for begin, end in flight.armed) if flight.armed else None,
         distance_m=_path_length(north_east, track_rows) if north_east else None,
-        max_height_m=_max(spans.known_values(flight.track, "altitude_relative_m")),
-        max_distance_m=_max(home_distances),
-        max_speed_m_s=_max(speeds),
-        max_climb_m_s=_max([-sink_rate for sink_rate in sink_rates]),
-        max_descent_m_s=_max(sink_rates),
-        max_tilt_deg=_max(tilts),
+        max_height_m=_max_or_none(spans.known_values(flight.track, "altitude_relative_m")),
+        max_distance_m=_max_or_none(home_distances),
+        max_speed_m_s=_max_or_none(speeds),
+        max_climb_m_s=_max_or_none([-sink_rate for sink_rate in sink_rates]),
+        max_descent_m_s=_max_or_none(sink_rates),
+        max_tilt_deg=_max_or_none(tilts),
         end_distance_m=home_distances[-1] if home_distances and not math.isnan(home_distances[-1]) else None,
         start_voltage_v=voltages[0] if voltages else None,
         end_voltage_v=voltages[-1] if voltages else None,
         min_voltage_v=min(voltages, default=None),
         start_remaining_percent=remaining[0] if remaining else None,
         end_remaining_percent=remaining[-1] if remaining else None,
-        max_current_a=_max(currents),
+        max_current_a=_max_or_none(currents),
         min_satellites=min(satellites, default=None),
-        max_hdop=_max(hdops),
-        max_vibration_m_s2=_max(vibrations),
+        max_hdop=_max_or_none(hdops),
+        max_vibration_m_s2=_max_or_none(vibrations),
         clips=sum(max(after - before, 0.0) for before, after in pairwise(clips)) if clips else None,
-        max_estimator_ratio=_max(estimator_ratios),
+        max_estimator_ratio=_max_or_none(estimator_ratios),
         lost_percent=spans.mean(flight.link, "lost_percent"),
     )
 
@@ -211,7 +211,7 @@ class _ArmedSpans:
         return total / weight if weight else None
 
 
-def _max(values: list[float]) -> float | None:
+def _max_or_none(values: list[float]) -> float | None:
     return max((value for value in values if math.isfinite(value)), default=None)
 
 
@@ -260,10 +260,11 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
         if throttle.is_low and not is_current_low:  # A low current gets the same advice below.
             advice = _STOPPED_MOTORS_ADVICE
         texts.append(f"throttle {throttle.text('%')}{advice}")
-    tilt = _max([abs(angle) for name in angles for angle in flight.attitude.between(name, begin_s, end_s)])
+    tilt = _max_or_none([abs(angle) for name in angles for angle in flight.attitude.between(name, begin_s, end_s)])
     if tilt is not None:
         texts.append(f"tilt up to {tilt:.0f}°")
-    max_error = _max([abs(error) for name in angles for error in _attitude_errors(flight, name, begin_s, end_s)])
+    errors = [abs(error) for name in angles for error in _attitude_errors(flight, name, begin_s, end_s)]
+    max_error = _max_or_none(errors)
     if max_error is not None:
         advice = ", so look at the attitude charts" if max_error >= _HIGH_ATTITUDE_ERROR_DEG else ""
         texts.append(f"attitude up to {max_error:.0f}° off its set-point{advice}")
