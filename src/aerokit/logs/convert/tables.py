@@ -172,7 +172,7 @@ class FlightTableWriter:
     """Writes one table, with a row for each position of each vehicle, and the values of other states at that time."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
-        self._table = kind(path, (*_SENDER_COLUMNS[:2], *FLIGHT))
+        self._table = kind(path, (*_SENDER_COLUMNS[:2], *FLIGHT))  # without the component id
         self._latest: dict[int, dict[str, Any]] = {}
         self._value_getters = [_value_getter(column.field) for column in FLIGHT]
         self.written: int = 0
