@@ -225,7 +225,7 @@ async def run_fly(options: argparse.Namespace) -> int:
     for part in PARTS:
         items = getattr(plan, part).to_items()
         if items:
-            emit_items(options, part, items, "in the file")
+            emit_items(options, part, items, state="in the file")
     # `_connect_and_fly` appends the flight, so that the flight's state is known here after an interrupt.
     flights: list[PlanFlight] = []
     interrupts = InterruptStack()

@@ -150,7 +150,7 @@ async def run_events(options: argparse.Namespace) -> int:
         printing = asyncio.create_task(_print_all(connection, options))
         stack.push_async_callback(_cancel, printing)
         await stack.enter_async_context(vehicles_on(connection, rates={}))
-        is_interrupted = await await_end(connection, options.seconds, printing)
+        is_interrupted = await await_end(connection, options.seconds, work=printing)
     return INTERRUPTED if is_interrupted and options.seconds is not None else DONE
 
 

@@ -126,7 +126,8 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
                 # Name the option of the command line instead of the argument of `upload`.
                 text = str(error).replace("a greater max_distance_m", "a greater --max-distance-m")
                 raise InvalidArgument(text.replace("plan, item", f"{part} item")) from None
-        emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")
+        text = f"{part}: {count} items uploaded to vehicle {vehicle.system_id}"
+        emit_part(options, part, count, state="uploaded", text=text)
 
 
 def _place_text(item: MissionItem) -> str:
@@ -209,7 +210,7 @@ async def _show(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         for part in options.parts:
             items = (await _download_part(vehicle, part, options)).to_items()
-            emit_items(options, part, items, "on the vehicle")
+            emit_items(options, part, items, state="on the vehicle")
     return DONE
 
 
@@ -248,7 +249,7 @@ async def _check(options: argparse.Namespace) -> int:
         items = getattr(plan, part).to_items()
         has_items = has_items or bool(items)
         if items or options.json:  # "fence: 0 items" would look as if the upload cleared the fence
-            emit_items(options, part, items, "in the file")
+            emit_items(options, part, items, state="in the file")
     if not has_items and not options.json:
         print(f"{options.file} has no items")
     warnings = _emit_warnings(plan, options)

@@ -128,7 +128,7 @@ class VehicleText:
         text_of = self._text_of
         text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
         text.append(f"{vehicle.system_id:>3} ", "bold")
-        columns = [
+        columns = [  # widths and texts
             (10, Text(vehicle.autopilot.name)),
             (12, text_of(vehicle.mode, _name)),
             (9, self._armed()),
