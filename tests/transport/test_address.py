@@ -152,7 +152,7 @@ def test_kinds_are_all_documented(kind: str) -> None:
         ("bluetooth://x", "bluetooth: unknown kind of link"),
         ("https:x", "https: unknown kind of link"),
         ("mcast:", "supported by pymavlink, not by aerokit"),
-        ("uds:/tmp/socket", "supported by pymavlink, not by aerokit"),
+        ("uds:/tmp/socket", "not by aerokit; a program can pass a Link object instead"),
         ("00000001.BIN", "a log in the autopilot's own format"),
         ("/dev/ttyACM0,", "the baud rate '' is not a whole number"),
         ("/dev/ttyACM0,fast", "the baud rate 'fast' is not a whole number"),

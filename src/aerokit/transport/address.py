@@ -321,7 +321,9 @@ class _Parser:
         return self.error(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
 
     def scheme_error(self, scheme: str) -> InvalidArgument:
-        reason = "supported by pymavlink, not by aerokit" if scheme in _PYMAVLINK_ONLY else "unknown kind of link"
+        reason = "unknown kind of link"
+        if scheme in _PYMAVLINK_ONLY:
+            reason = "supported by pymavlink, not by aerokit; a program can pass a Link object instead"
         return self.error(f"{scheme}: {reason}{did_you_mean(scheme, _SCHEMES)}")
 
     def error(self, reason: str) -> InvalidArgument:
