@@ -7,7 +7,7 @@ from pathlib import Path
 from aerokit.logs.flights import FlightLog
 from aerokit.logs.report.page import Paragraphs, Section, Table
 from aerokit.logs.report.sections import SECTIONS
-from aerokit.logs.report.statistics import STATISTICS, FlightStatistics
+from aerokit.logs.report.statistics import STATISTICS, FlightStatistics, statistics_of, summary
 
 
 def section_of(flight: FlightLog, title: str) -> Section:
@@ -45,6 +45,13 @@ def test_changes_by_autopilot_do_not_contradict_the_sentence_before() -> None:
 
 def test_comparison_has_all_statistics() -> None:
     assert list(FlightStatistics.__annotations__) == list(STATISTICS), "STATISTICS needs a row for each field"
+
+
+def test_summary_warns_of_value_out_of_range() -> None:
+    flight = FlightLog(Path("flight.tlog"), ends_at=10.0)
+    for time_s, level in enumerate([10.0, 45.0, 12.0]):
+        flight.vibration.add(float(time_s), level, 1.0, 1.0, 0.0)
+    assert "Check: vibration up to 45 m/s² (normal: below 30)." in summary(flight, statistics_of(flight))
 
 
 def test_link_section_of_bin_does_not_promise_lost_messages() -> None:
