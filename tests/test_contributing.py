@@ -74,4 +74,7 @@ def test_recipe_works(recipe: str, tmp_path: Path) -> None:
 
 def test_four_recipes_have_all_their_steps() -> None:
     assert len(RECIPES) == 4
-    assert [len(steps_until(recipe)) for recipe in RECIPES] == [3, 6, 10, 12]
+    counts = [len(steps_until(recipe)) for recipe in RECIPES]
+    assert counts == [3, 6, 10, 12], (
+        "a step begins with 'In `path`, before|at the end of|anew …:' or 'Then:' (see STEP)"
+    )

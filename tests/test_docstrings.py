@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import pytest
 from for_each import for_each
 
 import aerokit
@@ -46,7 +47,10 @@ def test_public_names_have_docstrings(name: str) -> None:
 def test_references_in_docstrings_exist() -> None:
     sources = "".join(path.read_text("utf-8") for path in Path(aerokit.__file__).parent.rglob("*.py"))
     for target in set(re.findall(r":(?:class|func|meth|attr|mod):`(?:[^`<]*<)?~?(aerokit[\w.]*)", sources)):
-        pkgutil.resolve_name(target)
+        try:
+            pkgutil.resolve_name(target)
+        except (AttributeError, ImportError) as error:
+            pytest.fail(f"{target}: {error}; is it in the lazy_exports of its package?")
 
 
 def without_docstring(module: ModuleType) -> Iterator[str]:

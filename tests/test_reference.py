@@ -93,7 +93,8 @@ def test_every_name_that_a_page_imports_is_listed(listing: Any, path: Path) -> N
                 continue
             module = importlib.import_module(str(node.module))
             for name in (alias.name for alias in node.names):
-                item = getattr(module, name)
+                item = getattr(module, name, None)
+                assert item is not None, f"{node.module} has no {name}; is it in the lazy_exports of its package?"
                 assert inspect.ismodule(item) or (item.__module__, name) in listed, f"{node.module}.{name}"
 
 

@@ -34,7 +34,10 @@ BY_DEFAULT = {
 def test_public_coroutines_are_all_in_table() -> None:
     names = awaited()
     missing, unknown = sorted(names.keys() - CALLS), sorted(CALLS.keys() - names)
-    assert not missing, f"add rows to tests/helpers/call_table.py or device_calls.py: {missing}"
+    assert not missing, (
+        "add rows to tests/helpers/call_table.py, or, for outputs and devices, to DEVICE_CALLS or DEVICES in"
+        f" device_calls.py: {missing}"
+    )
     assert not unknown, f"remove these rows, there are no such coroutines: {unknown}"
 
 
@@ -78,7 +81,10 @@ async def faults_of(stage: Stage, name: str, autopilot: str, points: int) -> Asy
         return
     rehearsed = await run(stage, name, None)
     if rehearsed.error is not None or rehearsed.counted is None:
-        yield f"{name} does not work: {rehearsed.error!r}"
+        yield (
+            f"{name} does not work: {rehearsed.error!r}. If the simulated vehicle lacks the command, add it to"
+            " sim/ardupilot/fixed_results.csv or sim/px4/commands.py"
+        )
         return
     await check_remains(stage, snapshot(stage))
     await anyio.sleep(2.0)
