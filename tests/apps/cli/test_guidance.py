@@ -43,7 +43,7 @@ def test_aerokit_alone_prints_help_by_task(capsys: pytest.CaptureFixture[str]) -
     assert all(f"\n{title}:\n" in printed for title in GROUPS)
     assert "\n  params " in printed.partition("parameters, files, devices:")[2].partition("\n\n")[0]
     listed = Counter(name for names in GROUPS.values() for name in names)
-    assert listed == Counter([*(command.name for command in COMMANDS), RUN])
+    assert listed == Counter([*(command.name for command in COMMANDS), RUN]), "name each once in GROUPS of main.py"
 
 
 @pytest.mark.parametrize(
