@@ -258,9 +258,9 @@ async def test_preemption_between_two_clocks_is_not_sleep() -> None:
     readings, slept = iter([5.0, 4.5, 5.0, 4.5, 5.0, 5.3]), list[float]()
     watch = LoopWatch(lambda _: None, slept.append, lambda: next(readings))
     for _ in range(2):
-        watch.arrival(watch._loop.time())
+        watch.arrival_time(watch._loop.time())
     assert slept == []
-    watch.arrival(watch._loop.time())
+    watch.arrival_time(watch._loop.time())
     assert slept == [pytest.approx(0.3)]
 
 
@@ -269,8 +269,8 @@ async def test_sleep_is_noticed_while_waiting_data_is_read() -> None:
     asleep, slept = [0.0], list[float]()
     watch = LoopWatch(lambda _: None, slept.append, lambda: asleep[0])
     began_at = watch._loop.time()
-    assert watch.arrival(began_at + 5.0) == began_at
+    assert watch.arrival_time(began_at + 5.0) == began_at
     asleep[0] = 600.0
     for later_s in (5.01, 5.06, 5.07):
-        assert watch.arrival(began_at + later_s) == began_at
+        assert watch.arrival_time(began_at + later_s) == began_at
     assert slept == [600.0]

@@ -234,10 +234,10 @@ def test_other_peer_needs_three_frames_in_the_time_of_three() -> None:
     other, (frame, _) = OtherPeer(), Sender().send(1.0)
     for frames in (1, 2, 3):
         other.add(frame, 10, True, True)
-        assert other.has_replaced_owner(9.0, 10.0) is (frames == 3)
-    assert not other.has_replaced_owner(1.29, 10.0)
-    assert other.has_replaced_owner(1.5, 6.0)
-    assert not other.has_replaced_owner(9.0, 0.0)
+        assert other.has_replaced_route_peer(9.0, 10.0) is (frames == 3)
+    assert not other.has_replaced_route_peer(1.29, 10.0)
+    assert other.has_replaced_route_peer(1.5, 6.0)
+    assert not other.has_replaced_route_peer(9.0, 0.0)
 
 
 def test_boot_time_of_a_frame() -> None:

@@ -16,7 +16,7 @@ import aerokit
 from aerokit.connection.routes import ROUTE_TIMEOUT_S
 from aerokit.errors import LinkLost
 from aerokit.hub import Endpoint, Hub
-from aerokit.hub.attachment import Attachment
+from aerokit.hub.running_endpoint import RunningEndpoint
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedVehicle, SimulatorServer
 from aerokit.transport import Link, memory_link_pair
@@ -69,16 +69,16 @@ class HubSideLink(DisturbedLink):
         super().begin()
         if self.away is not None:
             loop, (begin, end) = asyncio.get_running_loop(), self.away
-            loop.call_later(begin, self._attachment.link_interrupted, LinkLost("the cable was unplugged"))
-            loop.call_later(end, self._attachment.link_restored, end - begin)
+            loop.call_later(begin, self._endpoint.link_interrupted, LinkLost("the cable was unplugged"))
+            loop.call_later(end, self._endpoint.link_restored, end - begin)
 
     @property
     def unsent_bytes(self) -> int:
         return FULL if self._is_now(self.jam) else 0
 
     @property
-    def _attachment(self) -> Attachment:
-        assert isinstance(self._receiver, Attachment)
+    def _endpoint(self) -> RunningEndpoint:
+        assert isinstance(self._receiver, RunningEndpoint)
         return self._receiver
 
     def _is_now(self, when: tuple[float, float] | None) -> bool:

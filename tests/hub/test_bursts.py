@@ -226,13 +226,13 @@ async def test_port_that_closes_in_mid_burst_gets_nothing() -> None:
 
         def close_port(event: HubEvent) -> None:
             if event.kind == "loop":
-                hub._attachments["b"]._on_down()
+                hub._running_endpoints["b"]._on_down()
 
         hub.on_event(close_port)
         new = FrameEncoder(255, 190).encode(STATION)
         two.receiver.bytes_received(new + b"".join(frames[:10]), None)
         await settle()
-        assert not hub._attachments["b"].is_open, "the loop was reported"
+        assert not hub._running_endpoints["b"].is_open, "the loop was reported"
         assert new in frames_of(vehicles)
         vehicles.read(*frames[10:])
         assert one.written == []
@@ -251,7 +251,7 @@ async def test_port_that_closes_while_its_frames_are_checked() -> None:
         def close(event: HubEvent) -> None:
             kinds.append(event.kind)
             if event.kind == "duplicate_sender":
-                hub._attachments["a"]._on_down()
+                hub._running_endpoints["a"]._on_down()
 
         hub.on_event(close)
         while "duplicate_sender" not in kinds:
@@ -266,7 +266,7 @@ async def test_frames_before_the_loss_of_a_link_are_forwarded() -> None:
         frames = encoded(vehicle, *telemetry(2))
         for frame in frames:
             vehicles.receiver.bytes_received(frame, PEER)
-        hub._attachments["a"]._on_down()  # as after a read error in mid-burst
+        hub._running_endpoints["a"]._on_down()  # as after a read error in mid-burst
         await settle()
         assert frames_of(station) == frames
 

@@ -504,7 +504,7 @@ class ReopenableLinks:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.far: list[MemoryLink] = []
         self.can_be_opened = True
-        monkeypatch.setattr("aerokit.hub.attachment.create_link", self.make)
+        monkeypatch.setattr("aerokit.hub.running_endpoint.create_link", self.make)
 
     def make(self, *_: object, **__: object) -> Link:
         near, far = memory_link_pair()

@@ -107,7 +107,7 @@ async def test_disconnected_clients_leave_nothing() -> None:
             writer.close()
         await until(lambda: sum(event.kind == "client_left" for event in events) == 200)
         assert (len(router._ingresses), len(router._senders)) == (2, 2)
-        assert len(list(hub._attachments["stations"]._peers)) == 1
+        assert len(list(hub._running_endpoints["stations"]._peers)) == 1
         station.send(ORDER)
         await until(lambda: "COMMAND_LONG" in copter.received)
 
@@ -204,7 +204,7 @@ async def test_noise_sender_is_not_remembered() -> None:
             link.receiver.bytes_received(b"\xfd\x00 noise", f"{number}@stranger")
         assert of(hub, "udp").peers == 1
         assert of(hub, "udp").systems == ((1, 1),)
-        assert len(list(hub._attachments["udp"]._peers)) == 1 + MAX_UNVERIFIED_PEERS
+        assert len(list(hub._running_endpoints["udp"]._peers)) == 1 + MAX_UNVERIFIED_PEERS
 
 
 @virtual

@@ -9,7 +9,7 @@ from hub_stage import Program
 import aerokit
 from aerokit import events
 from aerokit.hub import shared
-from aerokit.hub.attachment import _min_queue_above_bytes
+from aerokit.hub.running_endpoint import _min_queue_above_bytes
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.sim import SimulatedCopter, SimulatorServer
 from aerokit.testing import run_virtual

@@ -153,7 +153,7 @@ class Bus:
             try:
                 takes, sinks = plans[frame.system_id][message_id]
             except KeyError:
-                takes, sinks = self._plan(frame)
+                takes, sinks = self._add_plan(frame)
             if takes == MIXED:
                 self._deliver_mixed(frame)
             else:
@@ -198,8 +198,8 @@ class Bus:
         self.wanted[message_id] = self.wanted.get(message_id, 0) + 1
         return once(lambda: self._detach(key, entry))
 
-    def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Return how to deliver frames with this system id and message id."""
+    def _add_plan(self, frame: Frame) -> _DeliveryPlan:
+        """Plan how to deliver frames with this system id and message id, and cache the plan."""
         entries = self._entries(frame)
         # A message outside the dialect has no sinks, because it cannot be decoded.
         if not entries or self.dialect.get(frame.message_id) is None:

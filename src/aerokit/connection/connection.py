@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 
     from aerokit.connection.bus import Detach, Sink
+    from aerokit.connection.frame_receiver import FrameCounts
     from aerokit.connection.multilink.routes import MultiLinkRoutes
     from aerokit.errors import LinkOpenError
     from aerokit.events import LinkStatus
@@ -144,7 +145,7 @@ class Connection:
             make_routes,
             self.bus,
             own_source=(self.source_system, self.source_component),
-            attached=self.attached,
+            vehicle_systems=self.attached,
             send=self._send_to_peer,
             now=self.now,
         )
@@ -404,7 +405,7 @@ class Connection:
         """Iterate over the counters of every remembered peer."""
         return self._receiver.statistics()
 
-    def counts(self, system_id: int) -> tuple[int, int]:
+    def counts(self, system_id: int) -> FrameCounts:
         """Return how many frames of this system were received, and how many sequence numbers are missing."""
         return self._receiver.counts(system_id)
 

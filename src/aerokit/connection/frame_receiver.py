@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.frame_observers import FrameObservers
 from aerokit.connection.heartbeats import discovery_event
@@ -33,6 +33,13 @@ MAX_UNVERIFIED_PEERS = 32
 
 MAX_SOURCES = 2048
 """Maximum number of (system id, component id) pairs, over all peers, that have their own counters."""
+
+
+class FrameCounts(NamedTuple):
+    """Numbers of frames of one system."""
+
+    received: int
+    lost: int  # missing sequence numbers
 
 
 class PeerTable:
@@ -173,7 +180,7 @@ class FrameReceiver:
     def receive(self, data: bytes, peer: Peer) -> None:
         now = self._clock()
         if now > self._loop_watch.late_after:
-            now = self._loop_watch.arrival(now)
+            now = self._loop_watch.arrival_time(now)
         framer = self.framers.get(peer)
         if framer is not None:
             frames = framer.receive(data, now)
@@ -212,6 +219,7 @@ class FrameReceiver:
     def _check_and_record(self, frame: Frame, framer: Framer, peer: Peer, *, has_suspects: bool) -> bool:
         """Check a frame, and write it to the recording of the connection. Return True if it is to be delivered."""
         multilink, signatures, observers = self._multilink, self._signatures, self.observers
+        # True if the route of the frame's sender leads to another peer.
         is_other_peer = len(self.framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
         if multilink is not None and multilink.is_duplicate(frame, peer, is_other_peer=is_other_peer):
             return False
@@ -241,14 +249,14 @@ class FrameReceiver:
     def statistics(self) -> Iterator[FramerStatistics]:
         return (framer.statistics for framer in self._peers)
 
-    def counts(self, system_id: int) -> tuple[int, int]:
+    def counts(self, system_id: int) -> FrameCounts:
         sources = [
             source
             for statistics in self.statistics()
             for source in statistics.sources.values()
             if source.system_id == system_id
         ]
-        return sum(source.received for source in sources), sum(source.lost for source in sources)
+        return FrameCounts(sum(source.received for source in sources), sum(source.lost for source in sources))
 
     def _on_blocked(self, seconds: float) -> None:
         if seconds >= BLOCKED_WARNING_S:

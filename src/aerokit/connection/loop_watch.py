@@ -75,7 +75,7 @@ class LoopWatch:
         # The largest of three readings is used, because a single reading may be too small; see `_detect_sleep`.
         self._suspended_before = max(suspended() for _ in range(3))  # seconds of suspension at the last check
         self.late_after: float = math.inf
-        """Data that is read before this loop time has not waited. For data that is read later, call :meth:`arrival`."""
+        """Data that is read before this loop time has not waited. For later reads, call :meth:`arrival_time`."""
         self._ran_at = self._loop.time()  # when the loop last ran, as far as known
         self._due = self._ran_at  # when the timer should fire
         self._timer: asyncio.TimerHandle | None = None  # None before start() and after close()
@@ -83,7 +83,7 @@ class LoopWatch:
         """Earliest possible receive time of data that is read now; infinite if the data cannot have waited."""
         # The last times at which the computer woke, with the seconds for which it was suspended.
         self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
-        # Next time at which `arrival` checks for a suspension. The check is slow.
+        # Next time at which `arrival_time` checks for a suspension. The check is slow.
         self._check_sleep_at = -math.inf
         self._has_read = False  # True if data was read since the last call of `_stop_catching_up_when_idle`
         self._idle_iterations = 0  # number of consecutive loop iterations in which nothing was read
@@ -97,7 +97,7 @@ class LoopWatch:
             self._timer.cancel()
             self._timer = None
 
-    def arrival(self, now: float) -> float:
+    def arrival_time(self, now: float) -> float:
         """Return the receive time of data that is read now.
 
         This time is earlier than ``now`` if the data may have waited.

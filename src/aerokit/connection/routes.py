@@ -28,9 +28,9 @@ MIN_TAKEOVER_FRAMES = 3
 
 
 class OtherPeer:
-    """A peer that sends with the ids of a component, although another peer owns the component's route.
+    """A peer that sends with the ids of a component, although the component's route leads to another peer.
 
-    The owner of a route is the peer to which messages for the component are sent.
+    The peer to which the route leads is called the route's peer. Messages for the component are sent to it.
     """
 
     __slots__ = (
@@ -44,7 +44,7 @@ class OtherPeer:
     )
 
     def __init__(self) -> None:
-        self._expected: int | None = None  # next sequence number of the owner when this peer began to send
+        self._expected: int | None = None  # next sequence number of the route's peer when this peer began to send
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
         # Number of frames since the last frame from the route's own peer, and the time of the first of them.
@@ -53,11 +53,12 @@ class OtherPeer:
         self.is_refusal_reported: bool = False
 
     def add(self, frame: Frame, expected: int, sequence_matches: bool | None, clock_matches: bool | None) -> None:
-        """Record a frame, and whether its sequence number and time since boot fit the route's owner (None: unknown).
+        """Record a frame, and whether its sequence number and time since boot continue those of the route's peer.
 
-        ``expected`` is the owner's next sequence number, which changes with each frame of the owner.
+        None means unknown. ``expected`` is the next sequence number of the route's peer, which changes with each of its
+        frames.
         """
-        if expected != self._expected:  # The owner has sent frames since the last call.
+        if expected != self._expected:  # The route's peer has sent frames since the last call.
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
@@ -72,16 +73,16 @@ class OtherPeer:
 
     @property
     def is_same_sender(self) -> bool | None:
-        """True if the owner's sender now uses this peer's address; False for another sender; None if unknown."""
+        """True if it is the sender of the route under a new address; False for another sender; None if unknown."""
         return False if self._sequence_matches is False else self._clock_matches
 
-    def has_replaced_owner(self, now: float, rate: float) -> bool:
-        """Return True if the sender has moved to this peer. ``rate`` is its number of frames per second."""
+    def has_replaced_route_peer(self, now: float, frames_per_s: float) -> bool:
+        """Return True if the sender of the route, which sends ``frames_per_s``, has moved to this peer."""
         # In the time in which the sender usually sends three frames, it has sent none from its old address.
         return (
             self.is_same_sender is True
             and self._frames >= MIN_TAKEOVER_FRAMES
-            and (now - self._began_at) * rate >= MIN_TAKEOVER_FRAMES
+            and (now - self._began_at) * frames_per_s >= MIN_TAKEOVER_FRAMES
         )
 
 
@@ -110,7 +111,7 @@ EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
 class _Route:
-    """Route to one component: the peer that owns it, and what is known about the owner's stream."""
+    """Route to one component: its peer, and what is known about the frames that arrive from this peer."""
 
     __slots__ = ("counters", "expected", "heartbeat_at", "peer", "rate", "sequence", "silent_since")
 
@@ -127,38 +128,38 @@ class _Route:
 
 
 class Routes:
-    """Routing table: maps each (system id, component id) to the peer that owns the route.
+    """Routing table: maps each (system id, component id) to the peer to which the route leads, the route's peer.
 
-    The first peer that sends a HEARTBEAT under these ids owns the route. Frames of other peers under the same ids are
-    dropped (``DuplicateSender``). Their sequence numbers and, where known, their time since boot show whether it is the
-    same sender, which has only changed its address. The owner is gone once it has disconnected, or after 3.5 s without
-    a heartbeat, not counting pauses of the event loop.
+    The first peer that sends a HEARTBEAT under these ids becomes the route's peer. Frames of other peers under the same
+    ids are dropped (``DuplicateSender``). Their sequence numbers and, where known, their time since boot show whether
+    it is the same sender, which has only changed its address. The route's peer is gone once it has disconnected, or
+    after 3.5 s without a heartbeat, not counting pauses of the event loop.
 
     Another peer takes over the route (``RouteChanged``)
 
     1. at once, if it is another port of the same host, and the same sender has sent three frames from there and none
        from its old port;
-    2. when the owner is gone, if the peer is on the same host (as after a reboot), is the same sender, or signs with
-       our key;
-    3. when the owner is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
+    2. when the route's peer is gone, if the other peer is on the same host (as after a reboot), is the same sender, or
+       signs with our key;
+    3. when the route's peer is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
 
-    A peer that was refused (``RouteChangeRefused``) is compared again only after the owner has sent again. The route of
-    a system with a vehicle object never expires.
+    A peer that was refused (``RouteChangeRefused``) is compared again only after the route's peer has sent again. The
+    route of a system with a vehicle object never expires.
 
-    ``attached`` has the system ids with a vehicle object. ``boot_clocks[component](received_at)`` returns the expected
-    time since boot of a component in milliseconds. ``publish`` publishes events.
+    ``vehicle_systems`` has the system ids with a vehicle object. ``boot_clocks[component](received_at)`` returns the
+    expected time since boot of a component in milliseconds. ``publish`` publishes events.
     """
 
     def __init__(
         self,
         link: Link,
         publish: Callable[[Event], object],
-        attached: Collection[int] = (),
+        vehicle_systems: Collection[int] = (),
         boot_clocks: Mapping[ComponentId, BootClock] | None = None,
         *,
         may_move: bool = False,
     ) -> None:
-        self._link, self._publish, self._attached = link, publish, attached
+        self._link, self._publish, self._vehicle_systems = link, publish, vehicle_systems
         self._boot_clocks = {} if boot_clocks is None else boot_clocks
         self._may_move = may_move  # True if a silent system may move to any host
         self._routes: dict[ComponentId, _Route] = {}
@@ -210,24 +211,25 @@ class Routes:
         return peers or EVERY_PEER
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
-        """Return True if the frame came from ``peer``, but another peer owns its sender's route."""
+        """Return True if the frame came from ``peer``, but its sender's route leads to another peer."""
         route = self._routes.get((frame.system_id, frame.component_id))
         return route is not None and route.peer != peer
 
     def try_move_route(self, frame: Frame, peer: Peer, *, is_signed: bool) -> bool:
-        """Make ``peer`` the owner of the route of the frame's sender, if the rules of this class allow the change.
+        """Make the route of the frame's sender lead to ``peer``, if the rules of this class allow the change.
 
-        Returns True if the owner was changed. ``is_signed`` is True if the frame is signed with our key.
+        Returns True if the route was changed. ``is_signed`` is True if the frame is signed with our key.
         """
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
         is_same_host = self._link.host_of(peer) == self._link.host_of(route.peer)
-        needs_no_evidence = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
+        has_vehicle_object = frame.system_id in self._vehicle_systems
+        needs_no_evidence = self._may_move or is_signed or is_same_host or not has_vehicle_object
         other = self._other_peer(source, peer)
         self._compare(other, route, frame)
-        has_replaced = is_same_host and other.has_replaced_owner(now, route.rate)
-        if has_replaced or (is_silent and (needs_no_evidence or other.is_same_sender)):
+        has_changed_port = is_same_host and other.has_replaced_route_peer(now, route.rate)
+        if has_changed_port or (is_silent and (needs_no_evidence or other.is_same_sender)):
             self._move_route(route, frame, peer)
             return True
         self._report(other, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
@@ -251,7 +253,7 @@ class Routes:
         live = {
             route.peer
             for (system_id, _), route in self._routes.items()
-            if system_id in self._attached or now - route.heartbeat_at <= PEER_TTL_S
+            if system_id in self._vehicle_systems or now - route.heartbeat_at <= PEER_TTL_S
         }
         evicted = next((peer for peer in peers if peer not in live), None)
         self._other_peers = {
@@ -260,7 +262,7 @@ class Routes:
         return evicted
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
-        """Return the peers that send as the autopilot although another peer owns its route."""
+        """Return the peers that send as the autopilot although its route leads to another peer."""
         autopilot = system_id, MavComponent.AUTOPILOT1
         return {
             peer
@@ -278,6 +280,7 @@ class Routes:
         return other
 
     def _compare(self, other: OtherPeer, route: _Route, frame: Frame) -> None:
+        """Compare a frame of another peer with the frames of the route's peer."""
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
         sequence_matches = _sequence_matches(frame, route, silent_s)
         clock = self._boot_clocks.get((frame.system_id, frame.component_id))
@@ -325,16 +328,16 @@ class Routes:
             self._routes = {
                 (system_id, component_id): route
                 for (system_id, component_id), route in self._routes.items()
-                if system_id in self._attached or now - route.heartbeat_at <= PEER_TTL_S
+                if system_id in self._vehicle_systems or now - route.heartbeat_at <= PEER_TTL_S
             }
         return len(self._routes) < MAX_ROUTES
 
 
-_SAME_PEER = object()  # key in `_other_peers` of a second sender that is received from the owner's peer
+_SAME_PEER = object()  # key in `_other_peers` of a second sender that is received from the route's peer
 
 
 def _sequence_matches(frame: Frame, route: _Route, silent_s: float) -> bool | None:
-    """Return True if a frame could be the next one of the route's owner by its sequence number. None if unknown."""
+    """Return True if a frame could be the next one of the route's peer by its sequence number. None if unknown."""
     if route.counters is None:
         return None
     # The number may be ahead of the expected one by the frames that were sent, but lost, since the last heartbeat: at

@@ -13,7 +13,7 @@ from aerokit._internal.async_block import async_block
 from aerokit.connection.frame_observers import Recording
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkError
-from aerokit.hub.attachment import Attachment, filters_of
+from aerokit.hub.running_endpoint import RunningEndpoint, filters_of
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.switch import Switch
 from aerokit.hub.values import Endpoint, HubEvent
@@ -79,7 +79,7 @@ class Hub:
             if names.count(name) > 1:
                 raise InvalidArgument(f"two endpoints have the name {name!r}: give each its own name")
         self._dialect = dialect
-        self._attachments: dict[str, Attachment] = {}  # by name
+        self._running_endpoints: dict[str, RunningEndpoint] = {}  # by name
         self._listeners: list[Callable[[HubEvent], object]] = []
         self._switch: Switch | None = None  # None while the hub is not open
         self._background: BackgroundTasks | None = None  # None while the hub is not open
@@ -116,7 +116,7 @@ class Hub:
     @property
     def endpoints(self) -> tuple[EndpointStatistics, ...]:
         """Counters of each endpoint, in the order in which they were added."""
-        return tuple(attachment.statistics() for attachment in self._attachments.values())
+        return tuple(endpoint.statistics() for endpoint in self._running_endpoints.values())
 
     async def add(self, endpoint: str | Endpoint | Link) -> EndpointStatistics:
         """Open another endpoint, and return its name, address and counters.
@@ -138,12 +138,14 @@ class Hub:
             ConnectionClosed: the hub is closed.
         """
         self._raise_unless_open()
-        attachment = self._attachments.pop(name, None)
-        if attachment is None:
-            raise InvalidArgument(f"no endpoint is named {name!r}; endpoints: {', '.join(self._attachments) or 'none'}")
-        attachment.close()
-        self._report(attachment, "removed", f"{name} was removed")
-        await _wait_until_closed([attachment])
+        endpoint = self._running_endpoints.pop(name, None)
+        if endpoint is None:
+            raise InvalidArgument(
+                f"no endpoint is named {name!r}; endpoints: {', '.join(self._running_endpoints) or 'none'}"
+            )
+        endpoint.close()
+        self._report(endpoint, "removed", f"{name} was removed")
+        await _wait_until_closed([endpoint])
 
     async def share(self, connection: Connection, *, name: str = "program") -> EndpointStatistics:
         """Add an open connection of this program as an endpoint.
@@ -159,9 +161,9 @@ class Hub:
         """
         self._raise_unless_open()
         connection.raise_if_ended()
-        links = [attachment.link for attachment in self._attachments.values() if attachment.is_open]
+        links = [endpoint.link for endpoint in self._running_endpoints.values() if endpoint.is_open]
         is_shared = any(isinstance(link, SharedLink) and link.connection is connection for link in links)
-        if is_shared and name not in self._attachments:
+        if is_shared and name not in self._running_endpoints:
             # With two endpoints for one connection, the hub would send a vehicle its own frames.
             raise InvalidArgument("connection = … is not allowed: this hub shares it already")
         return (await self._add(Endpoint(SharedLink(connection), name=name))).statistics()
@@ -199,53 +201,54 @@ class Hub:
 
     # ------------------------------------------------------------------------------------ internal
 
-    async def _add(self, endpoint: Endpoint) -> Attachment:
-        """Open an endpoint and attach it. With ``retry_open``, a failure is retried later."""
+    async def _add(self, endpoint: Endpoint) -> RunningEndpoint:
+        """Open an endpoint. With ``retry_open``, a failure is retried in the background."""
         assert self._switch is not None
         assert self._background is not None
         clock = asyncio.get_running_loop().time
-        attachment = Attachment(endpoint, self._switch, self._dialect, clock, self._report)
-        if attachment.name in self._attachments:
-            raise InvalidArgument(f"two endpoints have the name {attachment.name!r}: set Endpoint(name=…)")
-        self._attachments[attachment.name] = attachment
+        running = RunningEndpoint(endpoint, self._switch, self._dialect, clock, self._report)
+        if running.name in self._running_endpoints:
+            raise InvalidArgument(f"two endpoints have the name {running.name!r}: set Endpoint(name=…)")
+        self._running_endpoints[running.name] = running
         try:
-            await attachment.open()
+            await running.open()
         except BaseException as error:  # including a cancellation of this call
-            if not (endpoint.retry_open and isinstance(error, LinkError)):
-                if self._has(attachment):
-                    del self._attachments[attachment.name]
+            will_retry = endpoint.retry_open and isinstance(error, LinkError)
+            if not will_retry:
+                if self._has(running):
+                    del self._running_endpoints[running.name]
                 raise
-            self._report(attachment, "lost", f"{error}; it is retried until it can be opened")
-            self._background.start(lambda: self._retry_opening(attachment), "aerokit hub opening")
-        if not self._has(attachment):
-            attachment.close()
-            await _wait_until_closed([attachment])
-            raise ConnectionClosed(f"{attachment.name} was removed while it was being opened")
-        return attachment
+            self._report(running, "lost", f"{error}; it is retried until it can be opened")
+            self._background.start(lambda: self._retry_opening(running), "aerokit hub opening")
+        if not self._has(running):
+            running.close()
+            await _wait_until_closed([running])
+            raise ConnectionClosed(f"{running.name} was removed while it was being opened")
+        return running
 
-    def _has(self, attachment: Attachment) -> bool:
-        return self._attachments.get(attachment.name) is attachment
+    def _has(self, endpoint: RunningEndpoint) -> bool:
+        return self._running_endpoints.get(endpoint.name) is endpoint
 
-    async def _retry_opening(self, attachment: Attachment) -> None:
+    async def _retry_opening(self, endpoint: RunningEndpoint) -> None:
         backoff = Backoff()
-        while self._has(attachment):
+        while self._has(endpoint):
             await anyio.sleep(backoff.next_delay())
-            if not self._has(attachment):  # The endpoint was removed meanwhile.
+            if not self._has(endpoint):  # The endpoint was removed meanwhile.
                 return
             try:
-                await attachment.open()
+                await endpoint.open()
             except LinkError as error:
                 logger.debug("the link still cannot be opened: %s", error)
             else:
-                if not self._has(attachment):  # The endpoint was removed meanwhile.
-                    attachment.close()
+                if not self._has(endpoint):  # The endpoint was removed meanwhile.
+                    endpoint.close()
                 return
 
     async def _close(self) -> None:
         self._is_closed = True
-        attachments, self._attachments = list(self._attachments.values()), {}
-        for attachment in attachments:
-            attachment.close()
+        endpoints, self._running_endpoints = list(self._running_endpoints.values()), {}
+        for endpoint in endpoints:
+            endpoint.close()
         if self._switch is not None:
             self._switch.close()
             if self._switch.recording is not None:
@@ -254,7 +257,7 @@ class Hub:
             if self._background is not None:
                 await self._background.aclose()
         finally:
-            await _wait_until_closed(attachments)
+            await _wait_until_closed(endpoints)
 
     async def _flush_recording(self) -> None:
         while True:
@@ -267,9 +270,9 @@ class Hub:
             raise ConnectionClosed("the hub is closed" if self._is_closed else "enter the hub first: async with hub:")
         return self._switch
 
-    def _report(self, attachment: Attachment, kind: HubEventKind, text: str) -> None:
-        logger.log(logging.INFO if kind in _INFO_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text)
-        event = HubEvent(asyncio.get_running_loop().time(), attachment.name, kind, text)
+    def _report(self, endpoint: RunningEndpoint, kind: HubEventKind, text: str) -> None:
+        logger.log(logging.INFO if kind in _INFO_KINDS else logging.WARNING, "hub: %s: %s", endpoint.name, text)
+        event = HubEvent(asyncio.get_running_loop().time(), endpoint.name, kind, text)
         for listener in tuple(self._listeners):
             try:
                 listener(event)
@@ -302,10 +305,10 @@ def _as_endpoint(endpoint: str | Endpoint | Link) -> Endpoint:
     return endpoint if isinstance(endpoint, Endpoint) else Endpoint(endpoint)
 
 
-async def _wait_until_closed(attachments: list[Attachment]) -> None:
+async def _wait_until_closed(endpoints: list[RunningEndpoint]) -> None:
     with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
-        for attachment in attachments:
-            await attachment.wait_closed()
+        for endpoint in endpoints:
+            await endpoint.wait_closed()
 
 
 @checked

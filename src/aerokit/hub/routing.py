@@ -34,6 +34,7 @@ PortT = TypeVar("PortT")
 MAX_PLANS = 4096
 """Maximum number of cached plans per port."""
 
+_HEARTBEAT = 0
 _SETUP_SIGNING = 256
 _RADIOS = (109, 166)  # RADIO_STATUS, RADIO
 _UNKNOWN_SENDER = Sender(0, 0, -math.inf)
@@ -241,11 +242,12 @@ class Router(Generic[PortT]):
         if sender.port_number == number:
             sender.received_at = now
         else:
-            # An autopilot has priority over other senders with its ids, so it moves to this port at once.
-            must_move = not (message_id or sender.is_autopilot) and is_autopilot(body)
+            # An autopilot has priority over other senders with its ids, so its first HEARTBEAT moves the route at once.
+            must_move = message_id == _HEARTBEAT and not sender.is_autopilot and is_autopilot(body)
             self._record_at_other_port(sender, ingress, now, must_move)
-        if not message_id:
+        if not message_id:  # HEARTBEAT
             self._record_heartbeat(sender, ingress, body)
+        # The following lines are `TargetFields.target_of` without its calls, which take longer.
         try:
             offsets = self._offsets[message_id]
         except KeyError:
@@ -262,7 +264,7 @@ class Router(Generic[PortT]):
         try:
             return ingress.plans[key]
         except KeyError:
-            return self._plan(ingress, key)
+            return self._add_plan(ingress, key)
 
     # ------------------------------------------------------------------------------------ senders
 
@@ -347,7 +349,7 @@ class Router(Generic[PortT]):
 
     # -------------------------------------------------------------------------------------- plans
 
-    def _plan(self, ingress: Ingress[PortT], key: int) -> ForwardingPlan[PortT]:
+    def _add_plan(self, ingress: Ingress[PortT], key: int) -> ForwardingPlan[PortT]:
         """Make the plan for a key of `Ingress.plans`, and cache it."""
         if len(ingress.plans) >= MAX_PLANS:
             ingress.forget_plans()
@@ -355,10 +357,11 @@ class Router(Generic[PortT]):
         if plan.reason:  # This plan is not cached, because a sender could fill the cache with unknown targets.
             return plan
         ingress.plans[key] = plan
-        # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
-        # sender's, may change the data about the sender, so `route` must process them.
+        # The fast path of `route_all` is only for messages without a target. Heartbeats, and frames at another port
+        # than the sender's, may change the data about the sender, so `route` must process them.
         message_id, source = plan.message_id, key & 0xFFFF
-        if message_id and plan.sender.port_number == ingress.number and self._offsets.get(message_id) is None:
+        has_target_field = self._offsets.get(message_id) is not None
+        if message_id != _HEARTBEAT and plan.sender.port_number == ingress.number and not has_target_field:
             ingress.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
         return plan
 
@@ -370,20 +373,20 @@ class Router(Generic[PortT]):
         if message_id == _SETUP_SIGNING:
             return ForwardingPlan(stream_key, message_id, ids, reason="secret")
         has_target = system_id != 0
-        # The keys of the dictionary are used as a set that keeps its order.
-        numbers = dict.fromkeys(self._ingresses)
+        numbers = list(self._ingresses)
         if has_target:
-            numbers = self._ports_to(system_id, component_id, source, ingress.number)
+            numbers = self._port_numbers_of_target(system_id, component_id, sender, ingress.number)
             if not numbers:
                 return ForwardingPlan(stream_key, message_id, ids, reason="no_route")
         elif self._targets.is_command(message_id):
-            numbers = {number: None for number in numbers if not self._is_redundant(number, sender)}
-        numbers.pop(ingress.number, None)
+            numbers = [number for number in numbers if not self._is_redundant(number, sender)]
         # Any autopilot would adapt its message rates to this radio, even if the radio is not its own.
         if message_id in _RADIOS:
-            numbers = {number: None for number in numbers if not self._has_autopilot(number)}
+            numbers = [number for number in numbers if not self._has_autopilot(number)]
         outs, rate_limited = [], []
         for number in numbers:
+            if number == ingress.number:  # A frame never goes back to the port at which it arrived.
+                continue
             port = self._ingresses[number].port
             interval_s = self._min_interval(port, message_id)
             if interval_s is None:
@@ -396,35 +399,42 @@ class Router(Generic[PortT]):
         shared_outs = ingress.destinations.setdefault(tuple(outs), tuple(outs))
         return ForwardingPlan(stream_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
 
-    def _ports_to(self, system_id: int, component_id: int, source: int, ingress_number: int) -> dict[int, None]:
-        """Return the numbers of the ports for a frame to a component, or to a whole system (component 0)."""
-        origin = self._senders.get(source)
+    def _port_numbers_of_target(
+        self, system_id: int, component_id: int, sender: Sender, ingress_number: int
+    ) -> list[int]:
+        """Return the ports for a message from ``sender`` to a component, or to a whole system (component 0).
+
+        An empty list means that the target is unknown. A message of a sender to itself goes back to ``ingress_number``,
+        where the caller drops it, because this is no error.
+        """
         target = self._senders.get(system_id | component_id << 8) if component_id else None
         if target is not None:
-            # A sender's message to itself goes nowhere, because the caller removes the port at which it arrived. An
-            # empty result would count as an error: no route.
-            return {ingress_number: None} if target is origin else dict.fromkeys(target.destinations)
-        # A message for an unknown component goes to its whole system.
-        members = [sender for sender in self._senders.values() if sender.system_id == system_id]
-        autopilots = [member for member in members if member.is_autopilot]
-        numbers: dict[int, None] = {}
-        for member in sorted(members, key=lambda member: not member.is_autopilot):
+            return [ingress_number] if target is sender else list(target.destinations)
+        # A message for an unknown component goes to its whole system, to its autopilots first.
+        components = [component for component in self._senders.values() if component.system_id == system_id]
+        components.sort(key=lambda component: not component.is_autopilot)
+        autopilots = [component for component in components if component.is_autopilot]
+        numbers: list[int] = []
+        for component in components:
             # A vehicle needs no further port if one of the chosen ports reaches it.
-            is_reached = member.is_vehicle and any(member.is_at(number) for number in numbers)
+            is_reached = component.is_vehicle and any(component.is_at(number) for number in numbers)
             if is_reached:
                 continue
-            destinations = (ingress_number,) if member is origin else member.destinations
+            destinations = (ingress_number,) if component is sender else component.destinations
             for number in destinations:
-                # A port at which an autopilot is received is left out for other members. The autopilot would otherwise
-                # get the command twice.
-                if member.is_autopilot or not any(autopilot.is_at(number) for autopilot in autopilots):
-                    numbers[number] = None
+                # For the other components, a port at which an autopilot is received is left out. The autopilot would
+                # otherwise get the command twice.
+                reaches_autopilot = any(autopilot.is_at(number) for autopilot in autopilots)
+                if number not in numbers and (component.is_autopilot or not reaches_autopilot):
+                    numbers.append(number)
         return numbers
 
     def _is_redundant(self, number: int, sender: Sender) -> bool:
-        """Return True if the autopilots at this port get a broadcast command through other ports, or one sent it."""
-        here = [autopilot for autopilot in self._senders.values() if autopilot.is_autopilot and autopilot.is_at(number)]
-        return sender in here or (bool(here) and all(autopilot.port_number != number for autopilot in here))
+        """Return True if all autopilots at a port get a broadcast command through other ports, or if one sent it."""
+        autopilots = [member for member in self._senders.values() if member.is_autopilot and member.is_at(number)]
+        if not autopilots:
+            return False
+        return sender in autopilots or all(autopilot.port_number != number for autopilot in autopilots)
 
     def _has_autopilot(self, number: int) -> bool:
         return any(sender.is_autopilot and number in sender.ports for sender in self._senders.values())

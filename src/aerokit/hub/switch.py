@@ -88,11 +88,11 @@ class Switch:
         self._ports_to_flush.clear()
         self._queueing_ports.clear()
 
-    def arrival(self, now: float) -> float:
+    def arrival_time(self, now: float) -> float:
         """Return the earliest possible receive time of data that is read now."""
         # The data may have waited in a socket since the loop last ran, or while the computer was suspended.
         watch = self._loop_watch
-        return watch.arrival(now) if now > watch.late_after else now
+        return watch.arrival_time(now) if now > watch.late_after else now
 
     def _exclude_pause(self, paused_s: float) -> None:
         # Nothing was read during the pause, so it is no silence of senders.
@@ -111,13 +111,14 @@ class Switch:
     ) -> None:
         """Forward frames received at a port.
 
-        ``data`` has the received bytes; None if they are not exactly the bytes of these frames.
+        ``data`` has the received bytes; None if they are not exactly the bytes of these frames. If it is given, the
+        frames may be forwarded in one piece.
         """
         ingress = port.ingress  # A listener may remove the port during the checks below.
         if ingress is None or port.is_read_only:  # `ingress` is None if the port was removed.
             if port.guard is not None:
                 for frame in frames:
-                    port.guard.admits(frame, framer, port.peer)  # called because the guard records the ids of each peer
+                    port.guard.admits(frame, framer, port.peer)  # The guard must record the ids of each peer.
             port.counters.dropped["read_only"] += len(frames)
             return
         out_of_order = framer.late

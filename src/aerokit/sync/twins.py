@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots.telemetry import AutopilotVersion
     from aerokit.connection.bus import Overflow
     from aerokit.connection.cells import Source
+    from aerokit.connection.frame_receiver import FrameCounts
     from aerokit.errors import ParameterRejected, ParameterTimeout
     from aerokit.events import Event, LinkReport, LinkState, LinkStatus
     from aerokit.hub.values import Endpoint
@@ -454,7 +455,7 @@ class Connection(ConnectionTwin):
         """Return the event loop's time in seconds; all ages and deadlines use this clock."""
         return self.aio.now()
 
-    def counts(self, system_id: int) -> tuple[int, int]:
+    def counts(self, system_id: int) -> FrameCounts:
         """Return how many frames of this system were received, and how many sequence numbers are missing."""
         return self._loop.call(self.aio.counts, system_id)
 

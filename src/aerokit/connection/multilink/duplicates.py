@@ -30,7 +30,7 @@ COPY_WINDOW_FRAMES = 128
 class ReceivedFrame:
     """Record of a frame and its copies."""
 
-    __slots__ = ("_links", "_owner_links", "at", "count", "is_admitted", "is_delivered")
+    __slots__ = ("_links", "_route_peer_links", "at", "count", "is_admitted", "is_delivered")
 
     def __init__(self, at: float, count: int, link: int, *, is_other_peer: bool) -> None:
         self.at: float = at
@@ -40,21 +40,21 @@ class ReceivedFrame:
         self.is_admitted: bool = False
         """True if a copy has passed the signature check."""
         self.is_delivered: bool = False
-        # One bit for each link over which a copy arrived. `_owner_links` omits copies from a second sender with the
-        # same ids.
+        # One bit for each link over which a copy arrived. `_route_peer_links` has only copies from the peer to which
+        # messages for the sender go, not those of a second sender with the same ids.
         self._links = 1 << link
-        self._owner_links = 0 if is_other_peer else self._links
+        self._route_peer_links = 0 if is_other_peer else self._links
 
     def add(self, link: int, *, is_other_peer: bool) -> None:
         self._links |= 1 << link
         if not is_other_peer:
-            self._owner_links |= 1 << link
+            self._route_peer_links |= 1 << link
 
     def has_arrived_over(self, link: int) -> bool:
         return bool(self._links & 1 << link)
 
-    def has_arrived_from_owner_over(self, link: int) -> bool:
-        return bool(self._owner_links & 1 << link)
+    def has_arrived_from_route_peer_over(self, link: int) -> bool:
+        return bool(self._route_peer_links & 1 << link)
 
 
 class Copies:
@@ -182,13 +182,13 @@ class MergedStreams:
         """Count the copies of a frame as evidence that their links lead to one vehicle."""
         used, frame = choice.used, self.copies.current
         # If the link in use did not deliver the frame, the frame may come from another vehicle.
-        if used is None or used.is_other_hardware or not frame.has_arrived_from_owner_over(used.link):
+        if used is None or used.is_other_hardware or not frame.has_arrived_from_route_peer_over(used.link):
             return
         for candidate in choice.candidates.values():
             # The copy counts for the link over which it arrived and for the link in use. If these are the same, it
             # counts for every link with an earlier copy.
-            is_new = link == used.link or candidate.link in (link, used.link)
-            if is_new and frame.has_arrived_from_owner_over(candidate.link):
+            may_count = link == used.link or candidate.link in (link, used.link)
+            if may_count and frame.has_arrived_from_route_peer_over(candidate.link):
                 candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:

@@ -303,12 +303,12 @@ class LinkChoice:
     def record_command(self, now: float) -> None:
         self._command_at = now
 
-    def should_request_hardware(self, candidate: Candidate, *, is_attached: bool) -> bool:
+    def should_request_hardware(self, candidate: Candidate, *, has_vehicle_object: bool) -> bool:
         if candidate is not self.used:
             return candidate.needs_hardware and not candidate.is_same_vehicle
-        # Over the link in use, an attached vehicle object requests the id itself.
+        # Over the link in use, the vehicle object requests the id itself.
         has_other_links = len(self.candidates) > 1  # With a single link, there is no other id to compare with.
-        return candidate.needs_hardware and has_other_links and not is_attached
+        return candidate.needs_hardware and has_other_links and not has_vehicle_object
 
     def _is_confirmed_by_hardware(self, candidate: Candidate, now: float) -> bool:
         is_same = (

@@ -73,11 +73,11 @@ class LinkProbes:
         peer: Peer,
         now: float,
         *,
-        is_attached: bool,
+        has_vehicle_object: bool,
     ) -> None:
         """Send a probe, and a request for the hardware id, if they are due.
 
-        ``is_attached`` is True if the system has a vehicle object. All other systems share a limited rate of probes.
+        All systems without a vehicle object share a limited rate of probes.
         """
         # An unused costly link is probed rarely once it is known whether the link leads to the vehicle.
         is_idle = candidate.is_costly and candidate is not choice.used
@@ -86,7 +86,7 @@ class LinkProbes:
         key = system_id, candidate.link
         if now - self._probed_at.get(key, -math.inf) < interval_s - TIMER_TOLERANCE_S:
             return
-        if not is_attached and not self._take_token(now):
+        if not has_vehicle_object and not self._take_token(now):
             return
         self._probed_at[key] = now
         # The answer repeats `ts1`, which identifies the probe: our time in nanoseconds. The last three digits depend on
@@ -98,7 +98,7 @@ class LinkProbes:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = _Probe(system_id, candidate.link, now)
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
-        if choice.should_request_hardware(candidate, is_attached=is_attached):
+        if choice.should_request_hardware(candidate, has_vehicle_object=has_vehicle_object):
             candidate.count_hardware_request()
             self._send(_hardware_request(system_id), peer)
 

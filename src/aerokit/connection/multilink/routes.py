@@ -119,7 +119,7 @@ BROADCASTS = frozenset(message_type.ID for message_type in (m.Heartbeat, m.Times
 class MultiLinkRoutes:
     """Keeps one :class:`Routes` for each link, created by ``make_routes``, and chooses a link for each system.
 
-    ``own_source`` is our own (system id, component id). ``attached`` has the system ids with a vehicle object.
+    ``own_source`` is our own (system id, component id). ``vehicle_systems`` has the system ids with a vehicle object.
     """
 
     def __init__(
@@ -129,12 +129,12 @@ class MultiLinkRoutes:
         bus: Bus,
         *,
         own_source: tuple[int, int],
-        attached: Collection[int],
+        vehicle_systems: Collection[int],
         send: Callable[[Message, Peer], object],
         now: Callable[[], float],
     ) -> None:
         self._link, self._bus, self._now = link, bus, now
-        self._own_source, self._attached = own_source, attached
+        self._own_source, self._vehicle_systems = own_source, vehicle_systems
         self._routes = [make_routes() for _ in link.names]  # by index of the link
         self._choices: dict[int, LinkChoice] = {}  # system id → its links, and the link in use
         self._merged = MergedStreams(len(link.names), self._choices)
@@ -357,9 +357,9 @@ class MultiLinkRoutes:
 
     def _probe(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
         if choice.has_autopilot and candidate.is_available and not candidate.is_stalled:
-            is_attached = system_id in self._attached
+            has_vehicle_object = system_id in self._vehicle_systems
             for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):
-                self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)
+                self._probes.probe(system_id, choice, candidate, peer, now, has_vehicle_object=has_vehicle_object)
 
 
 # Maps the reason for a switch, which describes the new link, to the word that describes the previous link in the log.

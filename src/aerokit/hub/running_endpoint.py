@@ -1,4 +1,4 @@
-"""``Attachment``: an endpoint of a hub with its link and its ports; the receiver of the link."""
+"""``RunningEndpoint``: an endpoint of a hub with its link and its ports; the receiver of the link."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.framer import Framer
     from aerokit.transport.link import Link, Peer
 
-    Report = Callable[["Attachment", HubEventKind, str], object]
+    Report = Callable[["RunningEndpoint", HubEventKind, str], object]
 
 # Frames are queued while a link has more unsent bytes than this. A radio at 57600 baud sends 2048 bytes in 0.36 s.
 QUEUE_ABOVE_BYTES = {"serial": 2048, "pty": 2048}
@@ -40,10 +40,10 @@ UNBUFFERED_KINDS = ("udpin", "udpout", "udpbcast")
 _MAGICS = (bytes((MAGIC_V2,)), bytes((MAGIC_V1,)))
 
 
-class Attachment:
+class RunningEndpoint:
     """One endpoint with its link. Failures of the link do not affect other endpoints.
 
-    ``now`` is the loop's clock; ``report(attachment, kind, text)`` publishes an event.
+    ``now`` is the loop's clock; ``report(endpoint, kind, text)`` publishes an event.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Attachment:
             self.link = address
         self._is_shared = isinstance(self.link, SharedLink)  # True if the link is a connection of our own program
         self.name: str = endpoint.name or self.link.address
-        self.keeps_peers = True
+        self.keeps_peers = True  # see `PeerKeeper`
         self.is_open: bool = False
         self._owns_link = False  # True once this object has opened the link, and therefore must close it
         self._reports_bursts = False  # True if the link calls `burst_ended`
@@ -127,7 +127,8 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        # The datagrams that the link reads from one peer at once are forwarded together, if each begins with a frame.
+        # The datagrams that the link reads from one known peer at once are forwarded together, if each begins with a
+        # frame.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
@@ -153,7 +154,7 @@ class Attachment:
         try:
             now = self._now()
             # Frames of a SharedLink have not waited in a socket.
-            arrived_at = now if self._is_shared else self._switch.arrival(now)
+            arrived_at = now if self._is_shared else self._switch.arrival_time(now)
             port_peer = None if self._has_single_peer else peer
             framer = self._peers.framers.get(port_peer)
             is_whole = False  # True if the data consists of whole valid frames and nothing else
@@ -164,7 +165,7 @@ class Attachment:
                 is_whole = not has_partial_frame and framer.statistics.bad_bytes == bad_bytes_before
             else:
                 framer, frames = self._peers.receive_unverified(port_peer, data, arrived_at)
-                self._report_full(framer, port_peer)
+                self._report_rejected_peer(framer, port_peer)
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
                 self._switch.receive(port, framer, frames, data if is_whole else None, now, arrived_at)
@@ -268,7 +269,7 @@ class Attachment:
     def _report_peer(self, kind: HubEventKind, peer: Peer, text: str) -> None:
         self._report(self, kind, f"{_client_name(peer)}: {text}")
 
-    def _report_full(self, framer: Framer, peer: Peer) -> None:
+    def _report_rejected_peer(self, framer: Framer, peer: Peer) -> None:
         is_rejected = framer.statistics.frames > 0 and peer not in self._peers.framers
         if is_rejected and not self._is_full_reported:
             self._report_peer("peer_rejected", peer, f"rejected, because {MAX_PEERS} other peers are active")
