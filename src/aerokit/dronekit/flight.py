@@ -28,8 +28,8 @@ HOME_TIMEOUT_S = 10.0
 ORDER_POLL_INTERVAL_S = 0.02
 
 
-def _armed_order_kind(value: bool) -> str:
-    return "arm" if value else "disarm"
+def _armed_order_kind(armed: bool) -> str:
+    return "arm" if armed else "disarm"
 
 
 class FlightMethods(VehicleAttributes):
@@ -99,48 +99,48 @@ class FlightMethods(VehicleAttributes):
 
     @armed.setter
     def armed(self, value: bool) -> None:
-        if not self._dk_reports_armed(bool(value)) or self._dk_is_changing_armed_to(not value):
-            self._dk_set_armed(bool(value))
+        if not self._dk_reports_armed(bool(value)) or self._dk_has_pending_order(armed=not value):
+            self._dk_order_armed(bool(value))
         else:
             self._dk.check_link()
 
-    def _dk_reports_armed(self, value: bool) -> bool:
+    def _dk_reports_armed(self, armed: bool) -> bool:
         # An old HEARTBEAT of a disarmed vehicle is not trusted, because a pilot may have armed it since.
-        return self._armed == value and (value or not self._dk_is_heartbeat_old)
+        return self._armed == armed and (armed or not self._dk_is_heartbeat_old)
 
-    def _dk_set_armed(self, value: bool) -> BackgroundCall:
+    def _dk_order_armed(self, armed: bool) -> BackgroundCall:
         aio = self._dk.check_link()
-        order = self._dk.order(_armed_order_kind(value), flight_orders.change_armed, aio, value)
+        order = self._dk.order(_armed_order_kind(armed), flight_orders.arm_or_disarm, aio, armed)
         self._dk_arming = order
         return order
 
-    def _dk_is_changing_armed_to(self, value: bool) -> bool:
+    def _dk_has_pending_order(self, armed: bool) -> bool:
         order = self._dk_arming
-        return order is not None and order.kind == _armed_order_kind(value) and not order.done()
+        return order is not None and order.kind == _armed_order_kind(armed) and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports armed motors.
 
         Waiting raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle refuses, with its reasons.
         """
-        self._dk_change_armed(True, wait, timeout, "failed to arm vehicle")
+        self._dk_arm_or_disarm(True, wait, timeout, "failed to arm vehicle")
 
     def disarm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Disarm the motors; arguments and errors as for :meth:`arm`. A vehicle in the air refuses."""
-        self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
+        self._dk_arm_or_disarm(False, wait, timeout, "failed to disarm vehicle")
 
-    def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
-        is_overruling = self._dk_is_changing_armed_to(not value)
-        if self._dk_reports_armed(value) and not is_overruling:
+    def _dk_arm_or_disarm(self, armed: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
+        had_opposite_order = self._dk_has_pending_order(armed=not armed)
+        if self._dk_reports_armed(armed) and not had_opposite_order:  # There is nothing to do.
             self._dk.check_link()
             return
-        order = self._dk_set_armed(value)
+        order = self._dk_order_armed(armed)
         if wait:
 
             def is_done() -> bool:
-                # While an opposite order is unfinished, HEARTBEAT may report the wanted state only because that order
-                # has had no effect yet. Then wait until `order` is done.
-                return self._dk_reports_armed(value) and (order.done() or not is_overruling)
+                # HEARTBEAT may report the wanted state only because the opposite order has had no effect yet. Then wait
+                # until `order` is done.
+                return self._dk_reports_armed(armed) and (order.done() or not had_opposite_order)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
 
@@ -160,16 +160,15 @@ class FlightMethods(VehicleAttributes):
         if not abs(altitude) <= flight_orders.MAX_FLOAT:
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
-        order_take_off = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
         if not aio.autopilot.repositions_amsl:
-            # ArduPilot takes the altitude above home, and stays in its mode during the take-off.
-            unchanged_mode, params = (), (0, 0, 0, 0, 0, 0, altitude)
-            return order_take_off(unchanged_mode, MavCmd.NAV_TAKEOFF, *params)
+            # ArduPilot takes the altitude above home, and stays in its mode during the take-off, so no mode is given.
+            params = (0, 0, 0, 0, 0, 0, altitude)
+            return self._dk.order("takeoff", flight_orders.take_off, aio, (), MavCmd.NAV_TAKEOFF, *params)
         plan = aio.autopilot.take_off(altitude, self._dk_home_altitude(), is_vtol=aio.is_vtol)
         mode = aio.autopilot.mode_for("take_off")
         if plan is None or plan.command is None or mode is None:
             raise APIException("simple_takeoff: this vehicle has no take-off command")
-        return order_take_off((mode,), plan.command, *plan.params)
+        return self._dk.order("takeoff", flight_orders.take_off, aio, (mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None) -> None:
         """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`. Without an altitude, do nothing.

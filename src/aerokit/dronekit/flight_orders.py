@@ -106,13 +106,13 @@ async def change_mode(vehicle: AsyncVehicle, mode: Mode) -> None:
         await order.set_mode(mode, component_id=0)
 
 
-async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
+async def arm_or_disarm(vehicle: AsyncVehicle, armed: bool) -> None:
     """Arm or disarm, and wait until HEARTBEAT reports the change."""
     # Disarming ends orders that move the vehicle.
-    topics: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
+    topics: tuple[Subject, ...] = ("arm",) if armed else ("arm", "motion")
     try:
-        with vehicle.posted(*topics, armed=value) as order:
-            await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
+        with vehicle.posted(*topics, armed=armed) as order:
+            await order.command(MavCmd.COMPONENT_ARM_DISARM, float(armed), component_id=0)
             await order.wait_confirmed(ARMED_TIMEOUT_S)
     except CommandRejected:  # The vehicle certainly does not execute the command.
         raise

@@ -41,7 +41,7 @@ RETRY_DELAY_S = 1.0
 
 # Time-out of one attempt to set a parameter, in round trips of the link and in seconds; the longer time applies.
 ATTEMPT_ROUND_TRIPS, MIN_ATTEMPT_TIMEOUT_S = 3, 1.0
-LAST_ATTEMPT_SHARE = 0.5  # the last attempt has this share of the time-out
+LAST_ATTEMPT_SHARE = 0.5  # the attempt after the last retry has this share of the time-out
 
 ROUNDING = 0.01  # ArduPilot adds this value before it truncates a number to an integer
 
@@ -84,11 +84,11 @@ class ParameterDownload:
         async with anyio.create_task_group() as group:
             # Request the parameter during the download of all. The first that succeeds cancels the other.
 
-            async def read() -> None:
+            async def request() -> None:
                 if await self._request(name):
                     group.cancel_scope.cancel()
 
-            group.start_soon(read)
+            group.start_soon(request)
             await self._until_complete()
             group.cancel_scope.cancel()
 
@@ -176,7 +176,8 @@ class ParameterValues:
 
     def store(self, parameter: Parameter) -> bool:
         """Store a parameter. Return True if a value was added or changed."""
-        name, previous = parameter.name, self._parameters.get(parameter.name)
+        name = parameter.name
+        previous = self._parameters.get(name)
         if previous is None and len(self._parameters) >= MAX_PARAMETERS:
             return False  # A sender can make up names, so their number is limited.
         if previous is None and name != name.upper():

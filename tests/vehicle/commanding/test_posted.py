@@ -14,7 +14,7 @@ from flight_harness import Flight, in_the_air, now, open_flight
 from aerokit import messages as m
 from aerokit.autopilots import Mode, autopilot_for
 from aerokit.connection.cells import Source, StateCell
-from aerokit.dronekit.flight_orders import change_armed
+from aerokit.dronekit.flight_orders import arm_or_disarm
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -477,7 +477,7 @@ async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flig
 
         async def arm() -> None:
             with pytest.raises(OperationRejected, match=r"the mode changed to .*may still execute the command"):
-                await change_armed(grounded.vehicle, True)
+                await arm_or_disarm(grounded.vehicle, True)
 
         tasks.start_soon(arm)
         await anyio.sleep(0.5)
