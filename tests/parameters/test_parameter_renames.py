@@ -22,7 +22,7 @@ from aerokit.parameters import (
     translate_values,
 )
 from aerokit.parameters.parameter import check_name, checked_value, to_float32
-from aerokit.parameters.rename_table import GROUPS, OLDER, ONE_WAY, REPLACED
+from aerokit.parameters.rename_table import ONE_WAY, RENAMED_BEFORE_4_7, RENAMED_IN_4_7, REPLACED
 
 INT16, INT32, REAL32 = ParameterType.INT16, ParameterType.INT32, ParameterType.REAL32
 
@@ -67,7 +67,7 @@ def test_renamed_values_convert(old: str, new: str, old_value: float, new_value:
 
 
 def test_rename_table_is_consistent() -> None:
-    pairs = [pair.split(">") for _, _, text in GROUPS for pair in text.split()]
+    pairs = [pair.split(">") for _, _, text in RENAMED_IN_4_7 for pair in text.split()]
     assert len(pairs) == 258
     assert len({name for pair in pairs for name in pair}) == 2 * len(pairs)
     for name in (name for pair in pairs for name in pair):
@@ -222,14 +222,14 @@ def test_ambiguous_old_name_converts_one_way() -> None:
 
 
 def test_older_rename_table_is_consistent() -> None:
-    rows = [pair for _, _, _, text in (*OLDER, *ONE_WAY) for pair in text.split()]
+    rows = [pair for _, _, _, text in (*RENAMED_BEFORE_4_7, *ONE_WAY) for pair in text.split()]
     assert len(rows) == len({*rows})
     old, new = ({pair.split(">")[place] for pair in rows} for place in (0, 1))
     for name in (*old, *new, *REPLACED):
         check_name(name)
     # Names that were renamed twice have one divisor (`_by_name`).
-    renamed_twice = {pair.split(">")[0] for _, _, pairs in GROUPS for pair in pairs.split()}
-    for _, _, divisor, text in OLDER:
+    renamed_twice = {pair.split(">")[0] for _, _, pairs in RENAMED_IN_4_7 for pair in pairs.split()}
+    for _, _, divisor, text in RENAMED_BEFORE_4_7:
         assert divisor == 1 or not {pair.split(">")[1] for pair in text.split()} & renamed_twice
     assert not old & REPLACED.keys()
     assert not any(find_rename(name) for name in REPLACED)

@@ -316,25 +316,25 @@ class Autopilot:
 
     # --------------------------------------------------------------------------------- modes
 
-    def mode_of(self, heartbeat: messages.Heartbeat, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """Return the mode of a HEARTBEAT. ``extra`` has the names of modes that the vehicle reported by
+    def mode_of(self, heartbeat: messages.Heartbeat, reported_names: Mapping[int, str] = NO_MODES) -> Mode:
+        """Return the mode of a HEARTBEAT. ``reported_names`` has the names of modes that the vehicle reported by
         AVAILABLE_MODES.
         """
-        return self.mode(heartbeat.custom_mode, heartbeat.base_mode, extra)
+        return self.mode(heartbeat.custom_mode, heartbeat.base_mode, reported_names)
 
-    def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
+    def mode(self, custom_mode: int, base_mode: int, reported_names: Mapping[int, str] = NO_MODES) -> Mode:
         """Return the mode with these numbers. Without CUSTOM_MODE_ENABLED, base_mode determines the name."""
         if base_mode & CUSTOM_MODE_ENABLED:
-            return Mode(self.modes.name_of(custom_mode, extra), custom_mode, base_mode)
+            return Mode(self.modes.name_of(custom_mode, reported_names), custom_mode, base_mode)
         return Mode(base_mode_name(base_mode), custom_mode, base_mode)
 
-    def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
+    def find_mode(self, mode: str | int | Mode, reported_names: Mapping[int, str] = NO_MODES) -> Mode:
         """Find a mode by number, or by name, ignoring case, spaces and underscores.
 
         Raises:
             InvalidArgument: the name is unknown; the text lists the known names.
         """
-        return self.modes.find(mode, extra)
+        return self.modes.find(mode, reported_names)
 
     def mode_for(self, purpose: Purpose, *, is_vtol: bool = False) -> Mode | None:
         """Return the mode for a purpose, or None if the vehicle has no such mode.
@@ -349,11 +349,11 @@ class Autopilot:
         return ModeOrder((CUSTOM_MODE_ENABLED, mode.custom_mode, 0), CUSTOM_MODE_ENABLED, mode.custom_mode)
 
     def modes_of_command(
-        self, command: int, params: Sequence[float], extra: Mapping[int, str] = NO_MODES
+        self, command: int, params: Sequence[float], reported_names: Mapping[int, str] = NO_MODES
     ) -> tuple[Mode, ...]:
         """Return the modes to which a command may change; empty if there are none or they are unknown."""
         if command == MavCmd.DO_SET_MODE:
-            return self._modes_of_do_set_mode(params, extra)
+            return self._modes_of_do_set_mode(params, reported_names)
         names = {name for name in NAMES_OF_COMMANDS.get(command, ()) if name in self.modes.names}
         for purpose in PURPOSES_OF_COMMANDS.get(command, ()):
             for is_vtol in (False, True):
@@ -362,10 +362,10 @@ class Autopilot:
                     names.add(name)
         return tuple(self.modes.find(name) for name in sorted(names))
 
-    def _modes_of_do_set_mode(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+    def _modes_of_do_set_mode(self, params: Sequence[float], reported_names: Mapping[int, str]) -> tuple[Mode, ...]:
         """Return the mode that a DO_SET_MODE with these parameters sets, or nothing."""
         base_mode, custom_mode = mode_numbers((*params, 0.0, 0.0)[:2])  # Missing parameters are 0.
-        return (self.mode(custom_mode, base_mode, extra),) if base_mode & CUSTOM_MODE_ENABLED else ()
+        return (self.mode(custom_mode, base_mode, reported_names),) if base_mode & CUSTOM_MODE_ENABLED else ()
 
     def mode_to_arm_in(self) -> Mode | None:
         """Return a mode in which to arm if the current mode does not allow arming; None if no such mode is known."""

@@ -60,13 +60,13 @@ class ModeTable:
         """Maps custom_mode to name."""
         return self._names
 
-    def name_of(self, custom_mode: int, extra: Mapping[int, str] = NO_MODES) -> str:
-        """Return the name of the mode with this number. ``extra`` has the modes that the vehicle reported by
+    def name_of(self, custom_mode: int, reported_names: Mapping[int, str] = NO_MODES) -> str:
+        """Return the name of the mode with this number. ``reported_names`` has the modes that the vehicle reported by
         AVAILABLE_MODES.
         """
-        return self._names.get(custom_mode) or extra.get(custom_mode) or f"{_PREFIX_OF_NUMBER} {custom_mode}"
+        return self._names.get(custom_mode) or reported_names.get(custom_mode) or f"{_PREFIX_OF_NUMBER} {custom_mode}"
 
-    def find(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
+    def find(self, mode: str | int | Mode, reported_names: Mapping[int, str] = NO_MODES) -> Mode:
         """Find a mode by name or number.
 
         Raises:
@@ -74,22 +74,22 @@ class ModeTable:
         """
         if isinstance(mode, Mode):
             mode = mode.custom_mode
-        number = self._check(mode) if isinstance(mode, int) else self._number_of(mode, extra)
-        return Mode(self.name_of(number, extra), number)
+        number = self._check(mode) if isinstance(mode, int) else self._number_of(mode, reported_names)
+        return Mode(self.name_of(number, reported_names), number)
 
-    def _number_of(self, name: str, extra: Mapping[int, str]) -> int:
+    def _number_of(self, name: str, reported_names: Mapping[int, str]) -> int:
         """Return the number of a mode. The name may also be "MODE 42" or "42"."""
         key = _key(name)
         if key in self._numbers:
             return self._numbers[key]
-        for number, extra_name in extra.items():
-            if _key(extra_name) == key:
+        for number, reported_name in reported_names.items():
+            if _key(reported_name) == key:
                 return number
         # The mode number is in "MODE 42", or is the whole text.
         digits = key[len(_PREFIX_OF_NUMBER) :] if key.startswith(_PREFIX_OF_NUMBER) else key
         if digits.isdecimal() and len(digits) < 20:  # int() refuses thousands of digits with another error.
             return self._check(int(digits))
-        raise InvalidArgument(self._unknown_name_text(name, extra))
+        raise InvalidArgument(self._unknown_name_text(name, reported_names))
 
     def _check(self, number: int) -> int:
         if not 0 <= number <= _MAX_CUSTOM_MODE:
@@ -98,8 +98,11 @@ class ModeTable:
             )
         return int(number)
 
-    def _unknown_name_text(self, name: str, extra: Mapping[int, str]) -> str:
-        known_names = [*self.names, *(extra[number] for number in sorted(extra) if number not in self._names)]
+    def _unknown_name_text(self, name: str, reported_names: Mapping[int, str]) -> str:
+        known_names = [
+            *self.names,
+            *(reported_names[number] for number in sorted(reported_names) if number not in self._names),
+        ]
         hint = did_you_mean(name, known_names)
         return f"mode = {short_repr(name)} is not known{hint}; this vehicle's modes are {', '.join(known_names)}"
 

@@ -182,16 +182,16 @@ class Px4(Autopilot):
             # A plane circles its target with NAV_LOITER_RAD (80 m by default), so it never comes closer.
             self.arrival_radius_m: float = 120.0
 
-    def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
+    def mode(self, custom_mode: int, base_mode: int, reported_names: Mapping[int, str] = NO_MODES) -> Mode:
         """Return the mode with these numbers. An external mode has its registered name, if that is known."""
-        if custom_mode in _EXTERNAL_MODES and custom_mode in extra:
-            return Mode(extra[custom_mode], custom_mode, base_mode)
-        return super().mode(custom_mode, base_mode, extra)
+        if custom_mode in _EXTERNAL_MODES and custom_mode in reported_names:
+            return Mode(reported_names[custom_mode], custom_mode, base_mode)
+        return super().mode(custom_mode, base_mode, reported_names)
 
-    def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
+    def find_mode(self, mode: str | int | Mode, reported_names: Mapping[int, str] = NO_MODES) -> Mode:
         """Find a mode by name or number. External modes are also found by their registered names."""
-        numbered = super().find_mode(mode, extra)
-        return Mode(extra.get(numbered.custom_mode, numbered.name), numbered.custom_mode)
+        numbered = super().find_mode(mode, reported_names)
+        return Mode(reported_names.get(numbered.custom_mode, numbered.name), numbered.custom_mode)
 
     def mode_order(self, mode: Mode) -> ModeOrder:
         # param2 is the main mode, param3 the sub mode.
@@ -199,13 +199,13 @@ class Px4(Autopilot):
         sub = mode.custom_mode >> 24
         return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
 
-    def _modes_of_do_set_mode(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+    def _modes_of_do_set_mode(self, params: Sequence[float], reported_names: Mapping[int, str]) -> tuple[Mode, ...]:
         base_mode, main, sub = mode_numbers((*params, 0.0, 0.0, 0.0)[:3])  # Missing parameters are 0.
         if not base_mode & CUSTOM_MODE_ENABLED:
             return ()
         if main == MAIN_AUTO and not sub:
             sub = SUB_MISSION  # PX4's default
-        return (self.mode(px4_custom_mode(main & 0xFF, sub & 0xFF), CUSTOM_MODE_ENABLED, extra),)
+        return (self.mode(px4_custom_mode(main & 0xFF, sub & 0xFF), CUSTOM_MODE_ENABLED, reported_names),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
         """Like the method of the base class, but a reported name replaces EXTERNAL1 to EXTERNAL8."""

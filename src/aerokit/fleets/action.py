@@ -29,7 +29,7 @@ from aerokit.fleets.policy import FleetResult, MemberFailure
 from aerokit.vehicle.commanding.arbiter import STEERING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator
 
     from aerokit.connection.connection import Connection
     from aerokit.fleets.events import FleetEvent
@@ -206,14 +206,14 @@ class FleetAction:
 
     # --------------------------------------------------------------------------------- one member
 
-    async def _run_member(self, member: Member, wait_s: float) -> None:
+    async def _run_member(self, member: Member, delay_s: float) -> None:
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
         try:
             if self._has_failed_or_stopped(member):  # The failure or the stop came before this task.
                 return
-            await self._wait_to_start(member, wait_s)
+            await self._wait_to_start(member, delay_s)
             value = await self._execute_in_time(member)
         except AerokitError as error:
             if member.name not in self._stopped:
@@ -225,26 +225,29 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
+                # `FleetContext.newest_orders`, as if this action were the newest: an action that was created meanwhile
+                # then counts as a newer order.
                 self._final_orders[member.name] = _newest_order(member), self
                 member.record_success()
         finally:
             del self._tasks[member.name]
             self._check_finished()
 
-    async def _wait_to_start(self, member: Member, wait_s: float) -> None:
+    async def _wait_to_start(self, member: Member, delay_s: float) -> None:
         """Wait until the member may start. Raises OperationRejected or HeartbeatTimeout if it must not start."""
         before = self._orders_before.get(member.name) or self._orders_of(member)
-        is_checked_at_once = self._moves_members or self._kind is ActionKind.ARMS
-        # A landing without a delay is sent even if there is a newer action, because that action may fail.
-        is_overruled = is_checked_at_once and (
-            self._has_order_since(member, before) or (not self._ends_flight and self._has_newer_action(member))
-        )
-        while wait_s > START_TOLERANCE_S and not is_overruled:
-            await self._wait(member, wait_s)
+        is_overruled = False
+        if self._moves_members or self._kind is ActionKind.ARMS:  # Other actions are checked only after a delay.
+            # A landing without a delay is sent even if there is a newer action, because that action may fail.
+            has_newer_action = not self._ends_flight and self._has_newer_action(member)
+            is_overruled = has_newer_action or self._has_order_since(member, before)
+        remaining_s = delay_s
+        while remaining_s > START_TOLERANCE_S and not is_overruled:
+            await self._wait(member, remaining_s)
             is_overruled = self._has_order_since(member, before) or self._has_newer_action(member)
             # After a blocked event loop, the delays of several members may end at once. Each member then waits until
             # `stagger_s` after the last start.
-            wait_s = self._last_start_at + self._stagger_s - self._context.now()
+            remaining_s = self._last_start_at + self._stagger_s - self._context.now()
         if is_overruled:
             raise OperationRejected(
                 f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
@@ -303,7 +306,10 @@ class FleetAction:
         return _SentOrders(_newest_order(member), commands)
 
     def _has_order_since(self, member: Member, before: _SentOrders) -> bool:
-        """Return True if, since then, the program has told the member to land, return, disarm or, if we arm it, arm."""
+        """Return True if the program has told the member to land, return or disarm since ``before``.
+
+        For an action that arms, commands to arm count instead of those to disarm.
+        """
         newest, command_count = self._orders_of(member)
         must_land = newest is not before.newest and _is_ending_flight(member)
         # A command to disarm does not prevent a landing, because a vehicle in the air refuses to disarm.
@@ -353,19 +359,19 @@ class FleetAction:
         skipped = {member.name: member.reason for member in others if not member.is_available}
         stopping = [member for member in available if member.name in orders]
         for member in stopping:
-            if reason := self._reason_to_skip(member):
+            reason = self._reason_to_skip(member)
+            if reason:
                 skipped[member.name] = reason
             else:
                 self._policy_orders[member.name] = orders[member.name]
             has_finished = member.name in self._outcomes
-            # If a member has finished the action and gets no order, its outcome stays.
-            if member.name in self._policy_orders or not has_finished:
+            if not (reason and has_finished):  # A member that has finished and gets no order keeps its outcome.
                 self._set_stopped(member, failed, self._policy_orders.get(member.name))
         now, system_id = self._context.now(), failed.vehicle.system_id
         self._context.publish(
             PolicyApplied(now, system_id, failed.name, action=self.name, orders=self.policy_orders, skipped=skipped)
         )
-        self._send_policy_orders([member for member in stopping if member.name in self._policy_orders])
+        self._send_policy_orders()
         # The running actions are cancelled one loop iteration later. By then, the policy's orders have superseded those
         # of the actions, so that the cancelled actions do not send a hold.
         asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
@@ -380,15 +386,13 @@ class FleetAction:
             return ""
         return "it is disarmed" if member.vehicle.is_confirmed_disarmed else "this program does not fly it"
 
-    def _send_policy_orders(self, members: Sequence[Member]) -> None:
-        self._pending_policy_orders = len(members)
-        for member in members:
-            order = self._policy_orders[member.name]
-            task = self._context.background.start(
-                partial(self._send_order, member, order), f"aerokit policy {member.name}"
-            )
+    def _send_policy_orders(self) -> None:
+        self._pending_policy_orders = len(self._policy_orders)
+        for name, order in self._policy_orders.items():
+            send = partial(self._send_order, self._context.members[name], order)
+            task = self._context.background.start(send, f"aerokit policy {name}")
             if task is not None:  # The callback runs even if the task is cancelled before it begins.
-                task.add_done_callback(partial(self._on_order_end, member.name))
+                task.add_done_callback(partial(self._on_order_end, name))
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
         try:

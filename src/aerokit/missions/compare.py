@@ -135,70 +135,70 @@ _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000
 def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
     """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
+    forms: list[str] = []  # with a letter for each field
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
-        for letters in _ARDUPILOT_FORMS.get(item.command, ("",)):
-            yield from _stored_as(_letter_at(letters, number), value)
+        forms += _ARDUPILOT_FORMS.get(item.command, ("",))
     if storage in (ItemStorage.PX4, ItemStorage.ANY):
-        yield from _stored_as(_letter_at(_px4_letters(item), number), value)
+        forms.append(_px4_form(item))
+    for form in forms:
+        stored = _stored_as(form[number : number + 1] or "-", value)
+        if stored is not None:
+            yield stored
 
 
-def _letter_at(letters: str, number: int) -> str:
-    return letters[number] if number < len(letters) else "-"
-
-
-def _px4_letters(item: MissionItem) -> str:
+def _px4_form(item: MissionItem) -> str:
     if item.frame == MavFrame.MISSION:
         return _PX4_JUMP_FORMS if item.command == MavCmd.DO_JUMP else _PX4_OTHER_FORMS
     return _PX4_FORMS.get(item.command, "")
 
 
-def _stored_as(letter: str, value: float) -> Iterator[float]:
-    """Yield ``value`` as an autopilot sends it back if it has stored it in the form that ``letter`` stands for.
+def _stored_as(letter: str, value: float) -> float | None:
+    """Return ``value`` as an autopilot sends it back if it has stored it in the form that ``letter`` stands for.
 
-    Yields nothing if the autopilot cannot store the value.
+    Returns None if the autopilot cannot store the value.
     """
     if letter == "-":  # not stored
-        yield 0.0
-    elif letter == "2":  # always 2
-        yield 2.0
-    elif letter == "?":  # true if above 0
-        yield 1.0 if value > 0 else 0.0
-    elif letter == "g":  # only the sign
-        yield -1.0 if value < 0 else 1.0
-    elif not math.isfinite(value):
-        yield math.nan
-    elif letter in _INTEGERS:  # an integer with a range
+        return 0.0
+    if letter == "2":  # always 2
+        return 2.0
+    if letter == "?":  # true if above 0
+        return 1.0 if value > 0 else 0.0
+    if letter == "g":  # only the sign
+        return -1.0 if value < 0 else 1.0
+    if not math.isfinite(value):
+        return math.nan
+    if letter in _INTEGERS:  # an integer with a range
         low, high = _INTEGERS[letter]
         # C does not define the result of this conversion for a value that is out of range.
-        if low <= math.trunc(value) <= high:
-            yield float(math.trunc(value))
-    else:
-        yield from _finite_stored_as(letter, value)
+        return float(math.trunc(value)) if low <= math.trunc(value) <= high else None
+    return _finite_stored_as(letter, value)
 
 
-def _finite_stored_as(letter: str, value: float) -> Iterator[float]:
+def _finite_stored_as(letter: str, value: float) -> float | None:
     """Like `_stored_as`, for a finite value that is not stored as an integer with a range."""
     whole = math.trunc(value)
+    stored: float | None = None
     if letter == "f":  # 32-bit float, whose maximum is 3.4e38
         if abs(value) <= 3.4028234663852886e38:
-            yield struct.unpack("<f", struct.pack("<f", value))[0]
+            (stored,) = struct.unpack("<f", struct.pack("<f", value))
     elif letter == "c":  # limited to 0..255
-        yield float(max(0, min(255, whole)))
+        stored = float(max(0, min(255, whole)))
     elif letter == "U":  # 16 bits that wrap
-        yield float(whole & 0xFFFF)
+        stored = float(whole & 0xFFFF)
     elif letter == "y":  # heading
-        yield value % 360.0
+        stored = value % 360.0
     elif letter == "k":  # centimetres
-        yield math.trunc(value * 100.0) / 100.0
+        stored = math.trunc(value * 100.0) / 100.0
     elif letter == "h" and abs(value) <= 65_504:  # 16-bit float, whose maximum is 65504
-        yield struct.unpack("<e", struct.pack("<e", value))[0]
+        (stored,) = struct.unpack("<e", struct.pack("<e", value))
     elif letter == "n":  # at most 255; below 1 in steps of 1/256
-        yield math.trunc(value * 256.0) / 256.0 if 0 < value < 1 else float(min(255, whole))
+        stored = math.trunc(value * 256.0) / 256.0 if 0 < value < 1 else float(min(255, whole))
     elif letter == "r":  # metres
-        yield float(whole)
+        stored = float(whole)
     elif letter == "R":  # metres in a byte, above 255 m in tens
         radius = math.trunc(abs(value)) if abs(value) <= 255 else 10 * min(255, math.trunc(abs(value) / 10))
-        yield math.copysign(radius, value)
+        stored = math.copysign(radius, value)
+    return stored
 
 
 ALTITUDE_TOLERANCE_M = 0.011  # ArduPilot stores altitudes in whole centimetres

@@ -92,7 +92,7 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
         raise RemoteProtocolError(
             f"the param.pck is damaged: its header says that it has {count} of {total} parameters"
         )
-    parameters = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
+    parameters = list(_parameters(data, start, with_defaults=magic == _MAGIC_WITH_DEFAULTS))
     if len(parameters) != count:
         raise RemoteProtocolError(f"param.pck has {len(parameters)} parameters, but its header says {count}")
     if len({parameter.name for parameter in parameters}) != count:
@@ -116,7 +116,8 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
     for parameter in rows:
         name = check_name(parameter.name).encode("ascii")
         code = _code_of(parameter)
-        body += _entry(name, previous_name, code, checked_value(parameter.name, parameter.value, _STORED_TYPES[code]))
+        value = checked_value(parameter.name, parameter.value, _STORED_TYPES[code])
+        body += _encode_entry(name, previous_name, code, value)
         previous_name = name
     length = HEADER.size + len(body)
     if length > _MAX_SIZE:
@@ -151,7 +152,7 @@ def pack_for_download(
         if with_defaults and parameter.is_changed and parameter.default is not None:
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
-        entry = _entry(name, previous_name, code, *values)
+        entry = _encode_entry(name, previous_name, code, *values)
         # The last `unsplit_size` bytes of an entry must not be divided between two blocks: on PX4 the value and its
         # default, on ArduPilot (``whole_defaults=False``) only the last number (AP_Filesystem_Param.cpp).
         unsplit_size = _FORMATS[code].size * (len(values) if whole_defaults else 1)
@@ -200,7 +201,7 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     return PackEntry(name, _STORED_TYPES[code], value, default, end)
 
 
-def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
+def _parameters(data: bytes, index: int, *, with_defaults: bool) -> Iterator[Parameter]:
     """Yield the parameters in a downloaded file. ``index`` is the index of the first one."""
     position = _skip_padding(data, HEADER.size)
     previous_name = b""
@@ -243,7 +244,7 @@ def _code_of(parameter: Parameter) -> int:
     return _CODE_BY_TYPE[parameter.type]
 
 
-def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:
+def _encode_entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:
     common = _common_length(name, previous_name)
     type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
     # Four bits for the number of shared characters, and four for the number of own characters minus 1.

@@ -71,7 +71,7 @@ _COPTER_CENTI = (
 )
 
 # Renames in version 4.7. Each entry has the vehicle types, the divisor from old to new units, and ``OLD>NEW`` pairs.
-GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
+RENAMED_IN_4_7: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (_ALL, 1, "SYSID_THISMAV>MAV_SYSID SYSID_MYGCS>MAV_GCS_SYSID TELEM_DELAY>MAV_TELEM_DELAY"),
     (_ALL, 1, "ARMING_CHECK>ARMING_SKIPCHK EK3_MAX_FLOW>EK3_FLOW_MAX"),
     *((_ALL, 1, _change_prefix(f"SR{port}_", f"MAV{port + 1}_", _STREAMS)) for port in range(10)),
@@ -148,7 +148,7 @@ _IGNORED_SECTORS = " ".join(f"IGN_{name}{number}" for name in ("ANG", "WID") for
 
 # Renames before 4.7. Each entry has the first version with the new names, the vehicle types, the divisor from old to
 # new units, and ``OLD>NEW`` pairs.
-OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
+RENAMED_BEFORE_4_7: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("3.4", _OLDER_COPTER, 1, _moved("STB_", "ATC_ANG_", "RLL_P PIT_P YAW_P")),
     ("3.4", _OLDER_COPTER, 1, "MOT_THST_BAT_MAX>MOT_BAT_VOLT_MAX MOT_THST_BAT_MIN>MOT_BAT_VOLT_MIN"),
     ("3.4", _OLDER_COPTER, 1, "MOT_CURR_MAX>MOT_BAT_CURR_MAX FRAME>FRAME_TYPE"),
@@ -237,8 +237,8 @@ OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("4.6", _OLDER_ALL, 1, "GPS_CAN_NODEID1>GPS1_CAN_NODEID GPS_CAN_NODEID2>GPS2_CAN_NODEID"),
 )
 
-# Renames that are applied only from old to new names, in the format of `OLDER`. The old name still exists on another
-# vehicle type, where it has another meaning.
+# Renames that are applied only from old to new names, in the format of `RENAMED_BEFORE_4_7`. The old name still exists
+# on another vehicle type, where it has another meaning.
 ONE_WAY: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("3.4", _OLDER_COPTER, 1000, "THR_MIN>MOT_SPIN_MIN"),
     ("3.3", _ROVER, 1, "THR_MIN>MOT_THR_MIN THR_MAX>MOT_THR_MAX"),

@@ -16,7 +16,14 @@ from types import MappingProxyType
 from aerokit._internal.values import Snapshot
 from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
-from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OTHER_NEW_NAMES, REPLACED
+from aerokit.parameters.rename_table import (
+    INVERTED,
+    ONE_WAY,
+    OTHER_NEW_NAMES,
+    RENAMED_BEFORE_4_7,
+    RENAMED_IN_4_7,
+    REPLACED,
+)
 
 # Bit 0 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
 _ALL_BIT = 1
@@ -90,13 +97,13 @@ class Renamed(Snapshot):
         A value that is multiplied or divided is also rounded if ``type`` is an integer type. A value that the parameter
         cannot have, such as NaN or a fraction of a bit mask, is returned unchanged.
         """
-        converted = self._convert(value, self.requested)
+        converted = self._convert(value, from_name=self.requested)
         is_scaled = self._has_other_units and self.rename.divisor != 1 and math.isfinite(converted)
         return round(converted) if is_scaled and type is not None and type.is_integer else converted
 
     def to_requested(self, value: float) -> int | float:
         """Convert a value of the vehicle to the program's units."""
-        return self._convert(value, self.name)
+        return self._convert(value, from_name=self.name)
 
     def parameter(self, parameter: Parameter) -> Parameter:
         """Return the vehicle's parameter with the name and units that the program asked for.
@@ -124,10 +131,10 @@ class Renamed(Snapshot):
             return f"{text}. The firmware, perhaps a -dev version, is older than the change in {self.rename.since}."
         return f"{text}. Use {self.name}, its name since ArduPilot {self.rename.since}."
 
-    def _convert(self, value: float, source: str) -> int | float:
+    def _convert(self, value: float, from_name: str) -> int | float:
         if not self._has_other_units:
             return value
-        is_old = source in self.rename.old_names
+        is_old = from_name in self.rename.old_names
         return self.rename.to_new(value) if is_old else self.rename.to_old(value)
 
     @property
@@ -224,7 +231,7 @@ def _checks_to_make(skipped: int) -> int:
 def _by_name() -> Mapping[str, tuple[Rename, ...]]:
     """Map each old or new name to its renames."""
     two_way: dict[str, Rename] = {}
-    for vehicles, divisor, pairs in GROUPS:
+    for vehicles, divisor, pairs in RENAMED_IN_4_7:
         for old, new in _pairs(pairs):
             rename = Rename(
                 old,
@@ -235,7 +242,7 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
                 other_new=OTHER_NEW_NAMES.get(new, ()),
             )
             two_way.update(dict.fromkeys(rename.names, rename))
-    for since, vehicles, divisor, pairs in OLDER:
+    for since, vehicles, divisor, pairs in RENAMED_BEFORE_4_7:
         for old, new in _pairs(pairs):
             # If the new name was renamed again later, both renames become one with several old names. Its divisor is
             # that of the later rename, because the earlier one did not change the units.
