@@ -322,7 +322,7 @@ class Changes(AsyncIterator[T]):
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:
         self._loop = asyncio.get_running_loop()  # `__del__` needs it, and may run on another thread.
-        cell._add_iterator()
+        cell._add_iterator()  # From now on, every message of the cell is decoded.
         self._cell = cell
         self._every_arrival = every_arrival
         # Number of values read so far, counted as `_total` does. The current value counts as unread, because iteration

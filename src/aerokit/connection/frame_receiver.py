@@ -189,6 +189,7 @@ class FrameReceiver:
             self._update_checks()
         if not frames:
             return
+        # `late` has frames out of order, `foreign` those that may be of a second sender with the same ids.
         if self._bus.must_check_frames or framer.late or framer.foreign:
             self._check_and_deliver(frames, framer, peer)
             return
@@ -203,7 +204,6 @@ class FrameReceiver:
             self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
-        # True if frames arrived out of order (late), or may be those of a second sender with the same ids (foreign).
         has_suspects = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # A sink of an earlier frame has closed the connection.

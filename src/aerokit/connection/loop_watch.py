@@ -102,13 +102,14 @@ class LoopWatch:
 
         This time is earlier than ``now`` if the data may have waited.
         """
-        if now < self._check_sleep_at and self.oldest_arrival < math.inf:
+        if now < self._check_sleep_at and self._is_catching_up:
             # The clocks were checked a moment ago, and data that arrived during the last pause may still be unread.
             self._has_read = True
             return self.oldest_arrival
         self._check_sleep_at = now + CHECK_INTERVAL_S / 2
         has_slept = self._detect_sleep()
-        if self.oldest_arrival == math.inf and not has_slept and now <= self._due + LATE_THRESHOLD_S:
+        is_timer_late = now > self._due + LATE_THRESHOLD_S
+        if not (self._is_catching_up or has_slept or is_timer_late):
             # Data that is read in time proves that the loop runs, so the timer need not fire. Postponing it costs less
             # than waking the process only for the timer.
             if self._timer is not None:  # None after close(), which must not start the timer again
@@ -155,20 +156,26 @@ class LoopWatch:
 
     def _set_timer(self, now: float) -> None:
         self._ran_at, self._due = now, now + CHECK_INTERVAL_S
-        if self.oldest_arrival == math.inf:
+        if not self._is_catching_up:
             self.late_after = now + CHECK_INTERVAL_S / 2
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _start_catching_up(self) -> float:
         """Start reading the data that may have arrived during the pause. Return its earliest possible receive time."""
-        if self.oldest_arrival == math.inf:
+        if not self._is_catching_up:
             self.oldest_arrival = self._ran_at
             self.late_after = -math.inf
             self._idle_iterations = 0
             self._loop.call_soon(self._stop_catching_up_when_idle)
         return self.oldest_arrival
 
+    @property
+    def _is_catching_up(self) -> bool:
+        """True while data that arrived during a pause may still be unread."""
+        return self.oldest_arrival < math.inf
+
     def _stop_catching_up_when_idle(self) -> None:
+        # Called in every loop iteration while `_is_catching_up` is true.
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:  # The connection is closed.

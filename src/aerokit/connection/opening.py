@@ -166,23 +166,27 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
     _check_distinct(addresses, targets)
     if peers is not None:
         _check_that_peers_apply(targets)
-    factories: list[Callable[[], Link]] = []
-    costly: set[int] = set()
-    for index, (address, target) in enumerate(zip(addresses, targets)):  # noqa: B905 - equal lengths
-        if isinstance(target, Link):
-            factories.append(partial(_return_link, target))
-            continue
-        if target.option("costly") == "1":
-            costly.add(index)
-        if target.kind == "replay":
-            raise InvalidArgument(
-                f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
-            )
-        # Only listening links get the filter, because other kinds of links refuse the argument.
-        peer_filter = peers if target.kind in FILTERING_KINDS else None
-        # A lost link is reopened while another one works, even without ``reconnect``.
-        factories.append(partial(ReconnectingLink, partial(create_link, target, baud=baud, peers=peer_filter)))
+    factories = list(map(partial(_link_factory, baud=baud, peers=peers), addresses, targets))
+    costly = {
+        index for index, target in enumerate(targets) if not isinstance(target, Link) and target.option("costly") == "1"
+    }
     return MultiLink(factories, costly=costly, survives_loss=reconnect)
+
+
+def _link_factory(
+    address: str | Link, target: Link | LinkAddress, *, baud: int, peers: PeerFilter | None
+) -> Callable[[], Link]:
+    """Return a function that creates one of several links. ``target`` is the parsed ``address``."""
+    if isinstance(target, Link):
+        return lambda: target
+    if target.kind == "replay":
+        raise InvalidArgument(
+            f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
+        )
+    # Only listening links get the filter, because other kinds of links refuse the argument.
+    peer_filter = peers if target.kind in FILTERING_KINDS else None
+    # A lost link is reopened while another one works, even without ``reconnect``.
+    return partial(ReconnectingLink, partial(create_link, target, baud=baud, peers=peer_filter))
 
 
 def _check_that_peers_apply(targets: Sequence[Link | LinkAddress]) -> None:
@@ -216,10 +220,6 @@ def _target_key(target: Link | LinkAddress) -> object:
     # On zenoh networks, the same name with other endpoints is another vehicle.
     endpoints = [(name, value) for name, value in target.options if name in ("connect", "listen")]
     return target.kind, target.host, target.port, target.device, target.path, tuple(endpoints)
-
-
-def _return_link(link: Link) -> Link:
-    return link
 
 
 # With a probability of about 10 %, a pattern in this many bytes of noise looks like a damaged frame. Damaged frames are

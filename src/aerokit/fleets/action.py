@@ -345,20 +345,21 @@ class FleetAction:
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member) -> None:
+        """Ask the policy about the other members. Stop those for which it has an order, and send them the orders."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
         available = [member for member in others if member.is_available]
-        error, names = self._failed[failed.name], tuple(member.name for member in available)
-        failure = MemberFailure(failed.name, failed.group, self.name, error, others=names)
+        names = tuple(member.name for member in available)
+        failure = MemberFailure(failed.name, failed.group, self.name, self._failed[failed.name], others=names)
         orders = self._decide(failure)
         if not orders:
             return
         self._policy_cause = failed
         self._cancel_tasks_of([failed])
         skipped = {member.name: member.reason for member in others if not member.is_available}
-        stopping = [member for member in available if member.name in orders]
-        for member in stopping:
+        affected = [member for member in available if member.name in orders]
+        for member in affected:
             reason = self._reason_to_skip(member)
             if reason:
                 skipped[member.name] = reason
@@ -374,7 +375,7 @@ class FleetAction:
         self._send_policy_orders()
         # The running actions are cancelled one loop iteration later. By then, the policy's orders have superseded those
         # of the actions, so that the cancelled actions do not send a hold.
-        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
+        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, affected)
         if not self._policy_orders:
             self._publish_completed()
 

@@ -31,7 +31,7 @@ from aerokit.vehicle.connect import connect
 from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Sequence
+    from collections.abc import AsyncIterator, Collection, Iterator, Sequence
     from types import TracebackType
 
     from aerokit.mavlink.message import Message
@@ -93,18 +93,7 @@ async def fleet(
         ConnectFailed: some members were not found in time; the text lists the members found.
     """
     rules = PolicyRules(on_error, on_error_by_group or {})
-    if min_distance_m is not None and not 0 < min_distance_m < 10_000:
-        raise InvalidArgument(
-            f"min_distance_m = {min_distance_m!r} is not allowed: it must be above 0 and below 10,000 metres"
-        )
-    if on_too_close not in ("hold", "report"):
-        raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: it must be 'hold' or 'report'")
-    for group in on_error_by_group or {}:
-        if group and group not in (groups or {}):  # members outside of all groups have the group ""
-            allowed = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
-            raise InvalidArgument(f"on_error_by_group = {short_repr(group)} is not allowed: {allowed}")
-    if count is not None and count < 1:
-        raise InvalidArgument(f"count = {count} is not allowed: it must be 1 or more, or None")
+    _check_arguments(count, groups or {}, on_error_by_group or {}, min_distance_m, on_too_close)
     sources_by_name = _named_sources(sources)
     async with AsyncExitStack() as stack:
         networks: dict[str, Connection] = {}
@@ -115,11 +104,10 @@ async def fleet(
                 networks[name] = source
         given_names = {name for source in sources if isinstance(source, Mapping) for name in source}
         members = _members_of_vehicles(sources_by_name, given_names, networks)
-        searched = [name for name, source in sources_by_name.items() if not isinstance(source, Vehicle)]
-        searched_networks = {name: networks[name] for name in searched}
-        requested = _requested_ids(system_ids, searched)
-        ids = await _Discovery(searched_networks, requested, count, passed_count=len(members)).run(timeout)
-        systems = [_System(name, networks[name], system_id) for name in searched for system_id in ids[name]]
+        searched = {name: networks[name] for name, source in sources_by_name.items() if not isinstance(source, Vehicle)}
+        requested_ids = _requested_ids(system_ids, list(searched))
+        found_ids = await _Discovery(searched, requested_ids, count, passed_count=len(members)).run(timeout)
+        systems = [_System(name, searched[name], system_id) for name, ids in found_ids.items() for system_id in ids]
         connections = MemberConnections(timeout, rates)
         stack.push_async_exit(connections.aclose)
         for system, vehicle in zip(systems, await connections.open(systems), strict=True):
@@ -135,6 +123,27 @@ async def fleet(
             monitor = DistanceMonitor(context, min_distance_m, holds=on_too_close == "hold")
             context.background.start(monitor.run, "aerokit distances")
         yield Fleet(context)
+
+
+def _check_arguments(
+    count: int | None,
+    groups: Collection[str],
+    groups_with_policy: Iterable[str],
+    min_distance_m: float | None,
+    on_too_close: TooCloseAction,
+) -> None:
+    if min_distance_m is not None and not 0 < min_distance_m < 10_000:
+        raise InvalidArgument(
+            f"min_distance_m = {min_distance_m!r} is not allowed: it must be above 0 and below 10,000 metres"
+        )
+    if on_too_close not in ("hold", "report"):
+        raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: it must be 'hold' or 'report'")
+    for group in groups_with_policy:
+        if group and group not in groups:  # members outside of all groups have the group ""
+            allowed = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
+            raise InvalidArgument(f"on_error_by_group = {short_repr(group)} is not allowed: {allowed}")
+    if count is not None and count < 1:
+        raise InvalidArgument(f"count = {count} is not allowed: it must be 1 or more, or None")
 
 
 def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Source]:
@@ -341,7 +350,7 @@ class MemberConnections:
         self._connected: dict[_System, Vehicle] = {}
         self._error: Exception | None = None
         self._changed = asyncio.Event()  # set after each connection and each error
-        self._close = asyncio.Event()  # set at the end of the fleet's block
+        self._closing = asyncio.Event()  # set at the end of the fleet's block
         self._has_block_failed = False
         self._running_task_count = 0
         self._all_closed = asyncio.Event()
@@ -370,7 +379,7 @@ class MemberConnections:
         traceback: TracebackType | None = None,
     ) -> None:
         self._has_block_failed = error is not None
-        self._close.set()
+        self._closing.set()
         # While a task is still connecting, opening has failed: cancelling the tasks, without this wait, is enough.
         are_all_connected = len(self._connected) == self._running_task_count
         if self._running_task_count and are_all_connected:
@@ -383,7 +392,7 @@ class MemberConnections:
             async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
                 self._connected[system] = vehicle
                 self._changed.set()
-                await self._close.wait()
+                await self._closing.wait()
                 if self._has_block_failed:  # connect() must close the vehicle as after an error in its own block.
                     raise _BlockFailed
         except _BlockFailed:

@@ -228,17 +228,10 @@ class Router(Generic[PortT]):
             recent.newer[identity] = number, self._newest_port, now
             if ingress.echoes:
                 self._record_new_frame(ingress, source)
-        elif self._is_copy(earlier, number, now, is_out_of_order=is_out_of_order):
-            return self._duplicate
-        elif self._is_echo(earlier, number, now):
-            # This late frame is no copy: it returns in a slow loop, or equals the earlier one by chance, like the first
-            # command of a restarted program. It is forwarded until several frames prove a loop.
-            first_port, newest_port, _ = earlier
-            if self._record_echo(ingress, source, first_port, now):
-                return self._loop
-            recent.newer[identity] = first_port, newest_port, now
         else:
-            recent.newer[identity] = number, self._newest_port, now
+            refusal = self._check_equal_frame(ingress, identity, earlier, now, is_out_of_order=is_out_of_order)
+            if refusal is not None:
+                return refusal
         if sender.port_number == number:
             sender.received_at = now
         else:
@@ -294,20 +287,32 @@ class Router(Generic[PortT]):
         if sender.is_autopilot and sender.port_number != former_number:
             self._report("route_changed", sender.source, ingress, former_number)
 
-    def _is_copy(self, earlier: FrameRecord, number: int, now: float, *, is_out_of_order: bool) -> bool:
-        """Return True if a frame that equals an earlier frame is a copy of it."""
-        # A restarted program numbers its frames from the start again, so its first command may equal an earlier frame.
-        # A frame that was received at the same port and in sequence is therefore no copy.
+    def _check_equal_frame(
+        self, ingress: Ingress[PortT], identity: int, earlier: FrameRecord, now: float, *, is_out_of_order: bool
+    ) -> ForwardingPlan[PortT] | None:
+        """Return the plan that drops a frame, which equals an ``earlier`` one; None if it is to be forwarded."""
+        number, newer = ingress.number, self._recent.newer
         first_port, newest_port, received_at = earlier
+        age_s = now - received_at
         if first_port == number:
-            return is_out_of_order and now - received_at <= REPEAT_WINDOW_S
-        existed_then = number <= newest_port
-        return first_port in self._ingresses and existed_then and now - received_at <= DUPLICATE_WINDOW_S
-
-    def _is_echo(self, earlier: FrameRecord, number: int, now: float) -> bool:
-        """Return True if the earlier frame may have come back from the network behind port ``number``."""
-        first_port, newest_port, received_at = earlier
-        return first_port != number and number <= newest_port and now - received_at <= LOOP_WINDOW_S
+            # A restarted program numbers its frames from the start again, so its first command may equal an earlier
+            # frame. A frame that was received at the same port and in sequence is therefore no copy.
+            if is_out_of_order and age_s <= REPEAT_WINDOW_S:
+                return self._duplicate
+            newer[identity] = number, self._newest_port, now
+            return None
+        existed_then = number <= newest_port  # True if this port existed when the earlier frame was forwarded
+        if first_port in self._ingresses and existed_then and age_s <= DUPLICATE_WINDOW_S:
+            return self._duplicate
+        if not existed_then or age_s > LOOP_WINDOW_S:  # The earlier frame cannot have come back through this port.
+            newer[identity] = number, self._newest_port, now
+            return None
+        # This late frame is no copy: it returns in a slow loop, or equals the earlier one by chance, like the first
+        # command of a restarted program. It is forwarded until several frames prove a loop.
+        if self._record_echo(ingress, identity >> 24, first_port, now):
+            return self._loop
+        newer[identity] = first_port, newest_port, now
+        return None
 
     def _record_echo(self, ingress: Ingress[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True while a loop is proven."""
