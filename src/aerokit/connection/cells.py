@@ -362,9 +362,9 @@ class Changes(AsyncIterator[T]):
 
     async def _next_arrival(self) -> None:
         self._cell._raise_if_closed()
-        waiter: _Waiter[T] = _Waiter(self._cell, lambda _: True, 0.0)
+        waiter: _Waiter[T] = _Waiter(self._cell, lambda _: True, held_for=0.0)
         self._cell._add(waiter)
-        await waiter.wait(None, "")
+        await waiter.wait(timeout=None, description="")
 
 
 class _Listener(Generic[T]):

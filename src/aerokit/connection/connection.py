@@ -547,7 +547,7 @@ class Connection:
 
     def _try_to_send(self, message: Message) -> bool:
         """Send a message. Return False if no link accepted it."""
-        return self._encode_and_write(self._encoder, message, None)
+        return self._encode_and_write(self._encoder, message, to=None)
 
     def _encode_and_write(self, encoder: FrameEncoder, message: Message, to: int | None) -> bool:
         self.raise_if_ended()

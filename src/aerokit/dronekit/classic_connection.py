@@ -302,7 +302,8 @@ class OverrideRelease:
         overridden = self._overridden.setdefault(target, set())
         for channel in range(1, MAX_CHANNELS + 1):
             value = getattr(message, f"chan{channel}_raw")
-            if value == (RELEASE_UPPER if channel > MAVLINK_1_CHANNELS else RELEASE):
+            released = RELEASE_UPPER if channel > MAVLINK_1_CHANNELS else RELEASE
+            if value == released:
                 overridden.discard(channel)
             elif value not in (IGNORE, RELEASE):  # RELEASE leaves the channels above 8 unchanged.
                 overridden.add(channel)

@@ -147,7 +147,8 @@ class LatestMessage(Generic[MessageT]):
     def _must_decode(self) -> bool:
         """Return True if a handler needs the message now."""
         names = self._notified_names
-        if self._needs_every_message or not names <= self._ready_names:
+        have_all_values = names <= self._ready_names  # An attribute's first value also ends a wait_ready().
+        if self._needs_every_message or not have_all_values:
             return True
         for listeners in self._listeners:
             by_name = listeners.by_name

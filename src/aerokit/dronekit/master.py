@@ -216,7 +216,7 @@ class Master:
         vehicle = self._connection.vehicle
         if vehicle is None:
             return default
-        value: float | None = vehicle.parameters.get(name, False, default=default)
+        value: float | None = vehicle.parameters.get(name, wait_ready=False, default=default)
         return value
 
     def location(self, relative_alt: bool = False) -> Any:

@@ -261,7 +261,10 @@ class _Discovery:
                     await anyio.sleep(DISCOVERY_S)
         if not self._is_complete:
             silent = (name for name in self._searched if not self._found[name])
-            reasons = [f"\n  - network {name}: {explain_no_vehicle(self._networks[name], None)}" for name in silent]
+            reasons = [
+                f"\n  - network {name}: {explain_no_vehicle(self._networks[name], wanted_system=None)}"
+                for name in silent
+            ]
             raise ConnectFailed(f"within {timeout:g} s {self._describe()}{''.join(reasons)}")
         return {name: sorted(ids) for name, ids in self._found.items()}
 

@@ -193,8 +193,8 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # A frame is no copy of an earlier frame from the same port: their sequence numbers and checksums are
-                # equal by chance.
+                # A frame is no copy of an earlier frame from the same port, which is the first item of its record:
+                # their sequence numbers and checksums are equal by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == port_number:
                     newer[identity] = record
                     plan.sender.received_at = now

@@ -235,7 +235,7 @@ def changed_items(
     Further items at the end of ``actual`` are not reported. Differences that ``storage`` causes are ignored.
     """
     common = min(len(expected), len(actual))
-    changed = [i for i in range(common) if item_differences(expected[i], actual[i], storage)]
+    changed = [index for index in range(common) if item_differences(expected[index], actual[index], storage)]
     return (*changed, *range(common, len(expected)))
 
 

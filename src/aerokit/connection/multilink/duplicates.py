@@ -221,8 +221,8 @@ class MergedStreams:
             return False
         is_after_switch = frame.received_at - choice.switched_at <= ANSWER_TIMEOUT_S
         if is_after_switch and frame.message_id in ACKNOWLEDGEMENTS:
-            # Acknowledgements over the link in use are counted, but never refused.
-            return not stream.count_acknowledgement(frame.payload, link) or is_used_link
+            is_repetition = stream.count_acknowledgement(frame.payload, link)
+            return is_used_link or not is_repetition
         return True
 
     def _stream(self, frame: Frame) -> _Stream:

@@ -93,7 +93,7 @@ class Candidate:
         if self._clock_matches >= MIN_CLOCK_MATCHES and not awaits_hardware and not self.is_other_hardware:
             self.is_same_vehicle = True
         elif self._clock_mismatches >= MIN_CLOCK_MATCHES:
-            self._set_other_vehicle()
+            self._mark_as_other_vehicle()
 
     def record_copy(self, now: float) -> None:
         """Count a frame that arrived over this link and the link in use.
@@ -131,7 +131,7 @@ class Candidate:
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the link's hardware id contradicts that of the vehicle."""
         if is_other:
-            self._set_other_vehicle()
+            self._mark_as_other_vehicle()
             self.was_same_vehicle = False
         elif self.is_other_hardware:  # Until now the link led to another vehicle.
             self.is_same_vehicle = None
@@ -144,7 +144,7 @@ class Candidate:
     def reset_mismatches(self) -> None:
         self._clock_mismatches = 0
 
-    def _set_other_vehicle(self) -> None:
+    def _mark_as_other_vehicle(self) -> None:
         self.was_same_vehicle = self.was_same_vehicle or self.is_same_vehicle is True
         self.is_same_vehicle = False
 
