@@ -99,10 +99,8 @@ class ModeTable:
         return int(number)
 
     def _unknown_name_text(self, name: str, reported_names: Mapping[int, str]) -> str:
-        known_names = [
-            *self.names,
-            *(reported_names[number] for number in sorted(reported_names) if number not in self._names),
-        ]
+        further_names = (text for number, text in sorted(reported_names.items()) if number not in self._names)
+        known_names = [*self.names, *further_names]
         hint = did_you_mean(name, known_names)
         return f"mode = {short_repr(name)} is not known{hint}; this vehicle's modes are {', '.join(known_names)}"
 

@@ -131,7 +131,7 @@ class Bus:
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
         """Deliver every event of this class and of its subclasses to ``sink``."""
         self._event_sinks[event_type] = (*self._event_sinks.get(event_type, ()), sink)
-        return once(lambda: self._detach_event(event_type, sink))
+        return once(lambda: _remove_sink(self._event_sinks, event_type, sink))
 
     def deliver(self, frame: Frame) -> None:
         """Deliver a frame, decoded if needed. If a sink raises, the error is logged, and the other sinks are called."""
@@ -230,9 +230,6 @@ class Bus:
         self.wanted[message_id] -= 1
         if not self.wanted[message_id]:
             del self.wanted[message_id]
-
-    def _detach_event(self, event_type: type[Event], sink: Sink) -> None:
-        _remove_sink(self._event_sinks, event_type, sink)
 
 
 def _remove_sink(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:

@@ -46,10 +46,6 @@ class Source(Snapshot):
     message: str
 
 
-def _no_explanation() -> str:
-    return ""
-
-
 class StateCell(Generic[T]):
     """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
@@ -91,7 +87,7 @@ class StateCell(Generic[T]):
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
         # Returns why no values arrive, for time-out errors; "" if unknown.
-        self._explain_timeout: Callable[[], str] = _no_explanation
+        self._explain_timeout: Callable[[], str] = lambda: ""
         self._known = False  # False before the first value and after `forget`; `_latest` then has no meaning
         self._latest: T | None = None
         self._source: Source | None = None

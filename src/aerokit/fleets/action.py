@@ -568,6 +568,13 @@ class SelectionBase:
         """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
 
+    def _check_members(self, argument: str, names: Iterable[str]) -> None:
+        members = self.members
+        for name in names:
+            if name not in members:
+                text = f"{argument}: {short_repr(name)} is not a member; members: {', '.join(members)}"
+                raise InvalidArgument(text)
+
     @staticmethod
     def _check_available(member: Member, action: str, consequence: str) -> None:
         member.refresh()

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Literal
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, InvalidArgument, OperationRejected, SetpointStreamStopped, ValueUnknownError
@@ -19,6 +18,7 @@ from aerokit.fleets.action import ActionKind, FleetAction
 from aerokit.fleets.distances import POSITION_MAX_AGE_S, altitude_amsl, position_of
 from aerokit.fleets.events import FollowingStopped
 from aerokit.fleets.members import Member
+from aerokit.fleets.paths import vector_between
 from aerokit.fleets.policy import FleetResult
 from aerokit.fleets.separation import to_local_points
 from aerokit.fleets.travel import FlightOptions, Travel
@@ -140,6 +140,11 @@ def follow_velocity(
     scale = 1.0 if speed <= max_speed_m_s else max_speed_m_s / speed
     north, east, up = (component * scale for component in velocity)
     return north, east, up
+
+
+def _coordinates_of(member: Member) -> tuple[float, float, float]:
+    position = position_of(member, FOLLOWING_MAX_AGE_S)
+    return position.latitude_deg, position.longitude_deg, altitude_amsl(member, position)
 
 
 def _heading_for(formation: Formation, leader: Member, max_age_s: float) -> float | None:
@@ -298,25 +303,11 @@ class Following:
     def _vector_to_place(self, member: Member) -> tuple[float, float, float]:
         """Return the present vector from a member to its place, in metres north, east and up."""
         leader, vehicle = self._leader.vehicle, member.vehicle
-        leader_position = position_of(self._leader, FOLLOWING_MAX_AGE_S)
-        position = position_of(member, FOLLOWING_MAX_AGE_S)
-        points = to_local_points(
-            {
-                "leader": (
-                    leader_position.latitude_deg,
-                    leader_position.longitude_deg,
-                    altitude_amsl(self._leader, leader_position),
-                ),
-                "member": (position.latitude_deg, position.longitude_deg, altitude_amsl(member, position)),
-            }
-        )
+        points = to_local_points({"leader": _coordinates_of(self._leader), "member": _coordinates_of(member)})
         heading = _heading_for(self._formation, self._leader, FOLLOWING_MAX_AGE_S)
         offset = self._formation.offset_of(member.name, heading)
-        leader_north, leader_east, leader_up = points["leader"]
-        member_north, member_east, member_up = points["member"]
-        north = leader_north + offset.north_m - member_north
-        east = leader_east + offset.east_m - member_east
-        up = leader_up + offset.up_m - member_up
+        north, east, up = vector_between(points["member"], points["leader"])
+        north, east, up = north + offset.north_m, east + offset.east_m, up + offset.up_m
         # Both vehicles have moved on after their positions were measured. The leader's movement makes the vector
         # longer, the member's own movement makes it shorter.
         for moving_vehicle, sign in ((leader, 1.0), (vehicle, -1.0)):
@@ -403,12 +394,8 @@ class Formations(Travel):
         return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
-        for argument, names in (("leader", [leader]), ("formation", formation.offsets)):
-            for name in names:
-                if name not in self.members:
-                    raise InvalidArgument(
-                        f"{argument}: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
-                    )
+        self._check_members("leader", [leader])
+        self._check_members("formation", formation.offsets)
         if leader in formation.offsets:
             raise InvalidArgument(f"formation: {leader!r} is the leader and cannot have an offset")
         min_m = self._context.min_distance_m

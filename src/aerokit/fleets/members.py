@@ -99,7 +99,7 @@ class Member:
             vehicle.mode.observe(self._refresh_soon),
             # Observe every HEARTBEAT, because its MAV_STATE may change while mode and arming stay the same.
             vehicle.armed.observe(self._refresh_soon, every_arrival=True),
-            vehicle.connection.on_end(self._on_connection_end),
+            vehicle.connection.on_end(lambda error: self._set_lost(str(error))),
         ]
         if vehicle.is_silent:
             self._set_lost(vehicle.describe_link())
@@ -191,9 +191,6 @@ class Member:
     def _on_silent(self, event: VehicleSilent) -> None:
         if event.system_id == self.vehicle.system_id:
             self._set_lost(f"no heartbeat for {event.silent_for_s:.1f} s")
-
-    def _on_connection_end(self, error: Exception) -> None:
-        self._set_lost(str(error))
 
     def _on_recovered(self, event: VehicleRecovered) -> None:
         if event.system_id == self.vehicle.system_id:

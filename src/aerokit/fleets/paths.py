@@ -170,17 +170,18 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     """Return the closest approach of two legs at times that differ by at most ``slack_s``; None if there is none."""
     start, end = leg
     other_start, other_end = other
-    vector = _difference(end.place, start.place)
-    other_vector = _difference(other_end.place, other_start.place)
-    start_difference = _difference(start.place, other_start.place)
+    vector = vector_between(start.place, end.place)
+    other_vector = vector_between(other_start.place, other_end.place)
+    start_difference = vector_between(other_start.place, start.place)
     duration_s = end.t_s - start.t_s
     other_duration_s = other_end.t_s - other_start.t_s
 
     def time_difference(s: float, t: float) -> float:
         return (start.t_s + s * duration_s) - (other_start.t_s + t * other_duration_s)
 
-    def difference(s: float, t: float) -> list[float]:
-        return [start_difference[i] + s * vector[i] - t * other_vector[i] for i in range(3)]
+    def difference(s: float, t: float) -> LocalPoint:
+        north, east, up = [start_difference[i] + s * vector[i] - t * other_vector[i] for i in range(3)]
+        return north, east, up
 
     # With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The maximum time
     # difference cuts a strip out of the unit square of (s, t). If the closest points of the whole legs are in this
@@ -241,14 +242,14 @@ def _clip(corners: list[tuple[float, float]], outside: Callable[[float, float], 
 def _closest_on_edge(
     corner: tuple[float, float],
     other_corner: tuple[float, float],
-    difference: Sequence[float],
-    other_difference: Sequence[float],
+    difference: LocalPoint,
+    other_difference: LocalPoint,
 ) -> tuple[float, float]:
     """Return where two legs are closest, among the points (s, t) of one edge of the polygon in `_closest`.
 
     ``difference`` and ``other_difference`` are the vectors between the legs at the two corners.
     """
-    step = _difference(other_difference, difference)
+    step = vector_between(difference, other_difference)
     squared_length = _dot(step, step)
     fraction = 0.0
     if squared_length > 0:
@@ -258,8 +259,8 @@ def _closest_on_edge(
     return s + fraction * (other_s - s), t + fraction * (other_t - t)
 
 
-def _difference(point: Sequence[float], other: Sequence[float]) -> list[float]:
-    return [a - b for a, b in zip(point, other, strict=True)]
+def vector_between(start: LocalPoint, end: LocalPoint) -> LocalPoint:
+    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
 
 
 def _dot(vector: Sequence[float], other: Sequence[float]) -> float:

@@ -15,12 +15,13 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping
 from itertools import pairwise
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit._internal.files import read_bounded, write_atomically
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError, InvalidArgument
-from aerokit.fleets.paths import LocalPoint, Path, PathPoint
+from aerokit.fleets.paths import LocalPoint, Path, PathPoint, vector_between
 from aerokit.fleets.separation import Conflict, find_conflicts
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ class PathState(NamedTuple):
 def state_at(path: Path, at_s: float) -> PathState:
     """Return the position and the velocity on a path at a time."""
     points = path.points
-    next_index = bisect_right(points, at_s, key=_time_of)
+    next_index = bisect_right(points, at_s, key=attrgetter("t_s"))
     if next_index == 0:
         return PathState(points[0].place, (0.0, 0.0, 0.0))
     if next_index == len(points):
@@ -199,14 +200,10 @@ def state_at(path: Path, at_s: float) -> PathState:
     start, end = points[next_index - 1], points[next_index]  # The end is later than `at_s`, so the duration is not 0.
     duration_s = end.t_s - start.t_s
     fraction = (at_s - start.t_s) / duration_s
-    vector = [b - a for a, b in zip(start.place, end.place, strict=True)]
+    vector = vector_between(start.place, end.place)
     place = tuple(a + fraction * d for a, d in zip(start.place, vector, strict=True))
     velocity = tuple(d / duration_s for d in vector)
     return PathState(place, velocity)  # type: ignore[arg-type]
-
-
-def _time_of(point: PathPoint) -> float:
-    return point.t_s
 
 
 def _speed_between(start: PathPoint, end: PathPoint) -> float:

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit.errors import InvalidArgument, OperationRejected, OperationTimeout, StaleValueError
+from aerokit.errors import OperationRejected, OperationTimeout, StaleValueError
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.members import Member
-from aerokit.fleets.paths import Path
+from aerokit.fleets.paths import Path, vector_between
 from aerokit.fleets.policy import FleetResult
 from aerokit.fleets.separation import METRES_PER_DEGREE, find_conflicts, resting_paths
 from aerokit.fleets.show import Show, state_at
@@ -171,7 +170,7 @@ def track_deviation(path: Path, samples: Sequence[TrackSample]) -> TrackDeviatio
     velocity_squared = 0.0
     for at_s, point in samples:
         planned, velocity = state_at(path, at_s)
-        error = [p - q for p, q in zip(planned, point, strict=True)]
+        error = vector_between(point, planned)
         errors.append(math.hypot(*error))
         if math.hypot(*velocity) >= MIN_LAG_SPEED_M_S:
             error_times_velocity += sum(e * v for e, v in zip(error, velocity, strict=True))
@@ -198,16 +197,11 @@ def max_relative_error(
         for name, path in paths.items():
             point = _interpolate(samples.get(name, ()), at_s)
             if point is not None:
-                errors.append(_difference(state_at(path, at_s).place, point))
+                errors.append(vector_between(point, state_at(path, at_s).place))
         if len(errors) > 1:
             relative_errors = (math.dist(first, second) for first, second in combinations(errors, 2))
             largest_m = max(largest_m or 0.0, *relative_errors)
     return largest_m
-
-
-def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
-    north, east, up = (a - b for a, b in zip(point, other, strict=True))
-    return north, east, up
 
 
 def _interpolate(samples: Sequence[TrackSample], at_s: float) -> LocalPoint | None:
@@ -387,9 +381,7 @@ class Shows(Travel):
     # --------------------------------------------------------------------------------------- private
 
     def _local_origin(self, show: Show, origin: Position) -> LocalOrigin:
-        for name in show.tracks:
-            if name not in self.members:
-                raise InvalidArgument(f"show: {short_repr(name)} is not a member; members: {', '.join(self.members)}")
+        self._check_members("show", show.tracks)
         if origin.altitude_amsl_m is not None:
             return LocalOrigin(origin, origin.altitude_amsl_m)
         first_member = self.members[next(iter(show.tracks))]  # its home defines the altitude
@@ -469,7 +461,7 @@ def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> V
     velocity = state_at(path, at_s + lead_s).velocity
     speed = math.hypot(*velocity)
     north, east, up = follow_velocity(
-        _difference(state_at(path, at_s).place, position),
+        vector_between(position, state_at(path, at_s).place),
         velocity,
         gain=TRACK_GAIN,
         max_speed_m_s=max(CATCH_UP_FACTOR * speed, CATCH_UP_M_S) + CATCH_UP_M_S,

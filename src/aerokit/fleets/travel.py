@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument, OperationRejected, ValueUnknownError
 from aerokit.fleets.action import SelectionBase
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl, position_of
@@ -214,11 +213,7 @@ class Travel(SelectionBase):
             member.refresh()
         if callable(targets):
             return {member.name: _target_from_function(targets, member) for member in self if member.is_available}
-        for name in targets:
-            if name not in self.members:
-                raise InvalidArgument(
-                    f"targets: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
-                )
+        self._check_members("targets", targets)
         return {name: travel_target(target) for name, target in targets.items()}
 
     def _routes(self, targets: Mapping[str, Position]) -> tuple[list[Route], dict[str, LocalPoint]]:
@@ -460,15 +455,10 @@ class Missions(SelectionBase):
         return names
 
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
-        members: dict[str, Member] = {}
-        for name in missions:
-            if name not in self.members:
-                raise InvalidArgument(
-                    f"missions: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
-                )
-            member = self.members[name]
+        self._check_members("missions", missions)
+        members = {name: self.members[name] for name in missions}
+        for member in members.values():
             self._check_available(member, "missions", "nothing was sent")
-            members[name] = member
         return members
 
 

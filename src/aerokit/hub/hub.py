@@ -10,6 +10,7 @@ import anyio
 
 from aerokit._internal.arguments import checked, checks_arguments
 from aerokit._internal.async_block import async_block
+from aerokit.connection.bus import once
 from aerokit.connection.frame_observers import Recording
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkError
@@ -174,12 +175,7 @@ class Hub:
         The listener must return quickly; its exceptions are logged.
         """
         self._listeners.append(listener)
-
-        def detach() -> None:
-            if listener in self._listeners:
-                self._listeners.remove(listener)
-
-        return detach
+        return once(lambda: self._listeners.remove(listener))
 
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record every forwarded frame once to a ``.tlog`` file.

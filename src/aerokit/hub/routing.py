@@ -297,21 +297,17 @@ class Router(Generic[PortT]):
         if first_port == number:
             # A restarted program numbers its frames from the start again, so its first command may equal an earlier
             # frame. A frame that was received at the same port and in sequence is therefore no copy.
-            if is_out_of_order and age_s <= REPEAT_WINDOW_S:
-                return self._duplicate
-            newer[identity] = number, self._newest_port, now
-            return None
-        existed_then = number <= newest_port  # True if this port existed when the earlier frame was forwarded
-        if first_port in self._ingresses and existed_then and age_s <= DUPLICATE_WINDOW_S:
+            is_copy, may_be_echo = is_out_of_order and age_s <= REPEAT_WINDOW_S, False
+        else:
+            may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S  # This port existed then.
+            is_copy = may_be_echo and first_port in self._ingresses and age_s <= DUPLICATE_WINDOW_S
+        if is_copy:
             return self._duplicate
-        if not existed_then or age_s > LOOP_WINDOW_S:  # The earlier frame cannot have come back through this port.
-            newer[identity] = number, self._newest_port, now
-            return None
-        # This late frame is no copy: it returns in a slow loop, or equals the earlier one by chance, like the first
-        # command of a restarted program. It is forwarded until several frames prove a loop.
-        if self._record_echo(ingress, identity >> 24, first_port, now):
+        # A late frame may return in a slow loop, or equal the earlier one by chance, like the first command of a
+        # restarted program. It is forwarded until several frames prove a loop.
+        if may_be_echo and self._record_echo(ingress, identity >> 24, first_port, now):
             return self._loop
-        newer[identity] = first_port, newest_port, now
+        newer[identity] = (first_port, newest_port, now) if may_be_echo else (number, self._newest_port, now)
         return None
 
     def _record_echo(self, ingress: Ingress[PortT], source: int, first_port: int, now: float) -> bool:

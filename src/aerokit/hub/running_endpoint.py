@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
@@ -75,7 +75,7 @@ class RunningEndpoint:
         )
         self._is_full_reported = False  # True if it was reported that the endpoint has too many peers
         self.counters: EndpointCounters = EndpointCounters(Counter())
-        self._totals_of_forgotten_peers = _Totals(0, 0, 0, 0)
+        self._totals_of_forgotten_peers: Counter[str] = Counter()
         self._reported_refusals: set[str] = set()  # reasons that were already reported
         self._signer: FrameSigner | None = None  # verifies and adds signatures
         if endpoint.signing is not None:
@@ -98,9 +98,9 @@ class RunningEndpoint:
 
     def statistics(self) -> EndpointStatistics:
         router, ports = self._switch.router, tuple(self._ports.values())
-        totals = self._totals_of_forgotten_peers
+        totals = self._totals_of_forgotten_peers.copy()
         for framer in self._peers:
-            totals = totals.plus(framer)
+            totals.update(_totals_of(framer))
         systems: set[tuple[int, int]] = set()
         for port in ports:
             if port.ingress is not None:
@@ -113,12 +113,12 @@ class RunningEndpoint:
             address=self.link.address,
             is_open=self.is_open,
             peers=len(ports),
-            frames_in=totals.frames,
-            bytes_in=totals.bytes,
+            frames_in=totals["frames"],
+            bytes_in=totals["bytes"],
             frames_out=self.counters.frames_out,
             bytes_out=self.counters.bytes_out,
-            lost=totals.lost,
-            bad_bytes=totals.bad_bytes,
+            lost=totals["lost"],
+            bad_bytes=totals["bad_bytes"],
             waiting=sum(port.waiting for port in ports),
             dropped=dropped,
             systems=tuple(sorted(systems)),
@@ -249,7 +249,7 @@ class RunningEndpoint:
     def _forget_port(self, peer: Peer) -> None:
         framer = self._peers.framers.get(peer)
         if framer is not None:
-            self._totals_of_forgotten_peers = self._totals_of_forgotten_peers.plus(framer)
+            self._totals_of_forgotten_peers.update(_totals_of(framer))
         self._guard.forget(peer)
         port = self._ports.pop(peer, None)
         self._guard.has_several_peers = len(self._ports) > 1
@@ -305,19 +305,7 @@ def _keep_unknown(framer: Framer) -> None:
     framer.keep_unknown = True
 
 
-class _Totals(NamedTuple):
-    """Counters of received data, summed over framers."""
-
-    frames: int
-    bytes: int
-    lost: int
-    bad_bytes: int
-
-    def plus(self, framer: Framer) -> _Totals:
-        counters = framer.statistics
-        return _Totals(
-            self.frames + counters.frames,
-            self.bytes + counters.bytes,
-            self.lost + sum(source.lost for source in counters.sources.values()),
-            self.bad_bytes + counters.bad_bytes,
-        )
+def _totals_of(framer: Framer) -> Counter[str]:
+    counters = framer.statistics
+    lost = sum(source.lost for source in counters.sources.values())
+    return Counter(frames=counters.frames, bytes=counters.bytes, lost=lost, bad_bytes=counters.bad_bytes)

@@ -161,7 +161,7 @@ class IdentityGuard:
         self._routes = Routes(link, self._publish)
         self._report = report
         self._heartbeat_at: dict[Peer, float] = {}  # time of the last heartbeat of each peer
-        self._reported_at: dict[tuple[int, int], float] = {}  # (system id, component id) → time of the last event
+        self._reported_at: dict[str, float] = {}  # sender, e.g. "1/1" → time of the last event about it
         self._current_peer: Peer = None  # sender of the frame that is being checked
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
@@ -191,15 +191,14 @@ class IdentityGuard:
         self._heartbeat_at.pop(peer, None)
 
     def _publish(self, event: Event) -> None:
+        if not isinstance(event, (RouteChanged, DuplicateSender)):
+            return
+        sender = f"{event.system_id}/{event.component_id}"
         if isinstance(event, RouteChanged):
-            ids = event.system_id, event.component_id
-            self._reported_at.pop(ids, None)  # If the previous peer goes on sending, that is reported at once.
-            text = f"messages for {event.system_id}/{event.component_id} are sent here now, no longer to {event.before}"
+            self._reported_at.pop(sender, None)  # If the previous peer goes on sending, that is reported at once.
+            text = f"messages for {sender} are sent here now, no longer to {event.before}"
             self._report("route_changed", self._current_peer, text)
-        elif isinstance(event, DuplicateSender):
-            ids = event.system_id, event.component_id
-            if event.at - self._reported_at.get(ids, -math.inf) > REPEAT_EVENT_S:
-                self._reported_at[ids] = event.at
-                sender = f"{event.system_id}/{event.component_id}"
-                text = f"frames as {sender} are dropped, because another peer has these ids"
-                self._report("duplicate_sender", self._current_peer, text)
+        elif event.at - self._reported_at.get(sender, -math.inf) > REPEAT_EVENT_S:
+            self._reported_at[sender] = event.at
+            text = f"frames as {sender} are dropped, because another peer has these ids"
+            self._report("duplicate_sender", self._current_peer, text)

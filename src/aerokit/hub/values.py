@@ -64,11 +64,10 @@ class Endpoint(Snapshot):
             patterns = getattr(self, field)
             if isinstance(patterns, str) or not _are_texts(patterns):
                 raise _not_allowed(field, patterns, "a tuple of message names")
-        if not isinstance(self.rates, Mapping) or not _are_texts(self.rates):
+        # A bool is an int for Python, but not a number here.
+        has_names = isinstance(self.rates, Mapping) and _are_texts(self.rates)
+        if not has_names or any(isinstance(hz, bool) or not isinstance(hz, (int, float)) for hz in self.rates.values()):
             raise _not_allowed("rates", self.rates, "a mapping of message names to Hz, such as {'ATTITUDE': 5}")
-        for hz in self.rates.values():  # A bool is an int for Python, but not a number here.
-            if isinstance(hz, bool) or not isinstance(hz, (int, float)):
-                raise _not_allowed("rates", self.rates, "a mapping of message names to Hz, such as {'ATTITUDE': 5}")
         if isinstance(self.baud, bool) or not isinstance(self.baud, int) or self.baud <= 0:
             raise _not_allowed("baud", self.baud, "a whole number above 0")
         if not isinstance(self.name, str):

@@ -13,6 +13,8 @@ from aerokit.mavlink.enums import MavCmd, MavMountMode, MavVtolState
 from aerokit.missions.item import Altitudes, action_item, in_range, place_item, whole_number
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from aerokit.missions.item import MissionItem
     from aerokit.position import Home, Position
 
@@ -21,7 +23,11 @@ _MIN_DELAY_S = 0.001
 
 _MAX_DURATION_S = 86_400.0 * 365
 
-_SPEEDS = {"air": 0.0, "ground": 1.0, "climb": 2.0, "descent": 3.0}
+
+def _number_of(name: str, choice: str, numbers: Mapping[str, float]) -> float:
+    if choice not in numbers:
+        raise InvalidArgument(f"{name} = {choice!r} is not allowed: it must be {', '.join(map(repr, numbers))}")
+    return float(numbers[choice])
 
 
 def change_speed(
@@ -37,11 +43,9 @@ def change_speed(
     planes without airspeed sensor; None leaves it unchanged.
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_CHANGE_SPEED
     """
-    if kind not in _SPEEDS:
-        raise InvalidArgument(f"kind = {kind!r} is not allowed: it must be {', '.join(map(repr, _SPEEDS))}")
     return action_item(
         MavCmd.DO_CHANGE_SPEED,
-        _SPEEDS[kind],
+        _number_of("kind", kind, {"air": 0, "ground": 1, "climb": 2, "descent": 3}),
         in_range("speed_m_s", speed_m_s, 0, 1000, also_allowed=(-1, -2)),
         -1.0 if throttle_percent is None else in_range("throttle_percent", throttle_percent, 0, 100),
     )
@@ -100,16 +104,12 @@ def condition_yaw(
     ``rate_deg_s`` is 0 (the vehicle's default) to 360.
     https://mavlink.io/en/messages/common.html#MAV_CMD_CONDITION_YAW
     """
-    directions = {"shortest": 0.0, "clockwise": 1.0, "counterclockwise": -1.0}
-    if direction not in directions:
-        raise InvalidArgument(
-            f"direction = {direction!r} is not allowed: it must be {', '.join(map(repr, directions))}"
-        )
+    direction_number = _number_of("direction", direction, {"shortest": 0, "clockwise": 1, "counterclockwise": -1})
     return action_item(
         MavCmd.CONDITION_YAW,
         in_range("heading_deg", heading_deg, 0, 360),
         in_range("rate_deg_s", rate_deg_s, 0, 360),
-        directions[direction],
+        direction_number,
         float(relative),
     )
 
@@ -166,9 +166,7 @@ def vtol_transition(to: Literal["multicopter", "fixed_wing"]) -> MissionItem:
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_VTOL_TRANSITION
     """
     states = {"multicopter": MavVtolState.MC, "fixed_wing": MavVtolState.FW}
-    if to not in states:
-        raise InvalidArgument(f"to = {to!r} is not allowed: it must be {', '.join(map(repr, states))}")
-    return action_item(MavCmd.DO_VTOL_TRANSITION, float(states[to]))
+    return action_item(MavCmd.DO_VTOL_TRANSITION, _number_of("to", to, states))
 
 
 def land_start() -> MissionItem:

@@ -341,21 +341,18 @@ def _evaluate(condition: str, values: Values) -> bool:
 
 def _compare(value: SettingValue, operator: str, text: str) -> bool:
     """Evaluate one test. Comparing a number with a text gives False."""
-    if isinstance(value, (str, bytes)):
-        if operator not in ("=", "!="):
-            return False
-        is_equal = settings_equal(value, text)
-        return is_equal if operator == "=" else not is_equal
-    number = number_or_none(text)
-    if number is None:
+    other = text if isinstance(value, (str, bytes)) else number_or_none(text)
+    if other is None:
         return False
     # Do not use ==, because a value sent as a 32-bit float differs a little from the decimal number in the file.
-    is_equal = settings_equal(value, number)
+    is_equal = settings_equal(value, other)
     if operator in ("=", "!="):
         return is_equal if operator == "=" else not is_equal
+    if isinstance(value, (str, bytes)) or isinstance(other, str):  # Texts have no order.
+        return False
     if is_equal:
         return operator in (">=", "<=")
-    return value > number if operator in (">", ">=") else value < number
+    return value > other if operator in (">", ">=") else value < other
 
 
 # ----------------------------------------------------------------------------------------- the file

@@ -14,16 +14,9 @@ from functools import lru_cache
 from types import MappingProxyType
 
 from aerokit._internal.values import Snapshot
+from aerokit.parameters import rename_table
 from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
-from aerokit.parameters.rename_table import (
-    INVERTED,
-    ONE_WAY,
-    OTHER_NEW_NAMES,
-    RENAMED_BEFORE_4_7,
-    RENAMED_IN_4_7,
-    REPLACED,
-)
 
 # Bit 0 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
 _ALL_BIT = 1
@@ -159,7 +152,7 @@ def other_names(name: str) -> tuple[str, ...]:
 
 def replacement_of(name: str) -> str:
     """Describe what replaces a parameter that has no one-to-one replacement; empty if unknown."""
-    return REPLACED.get(name, "")
+    return rename_table.REPLACED.get(name, "")
 
 
 def resolve_rename(name: str, known: Container[str]) -> Renamed | None:
@@ -231,18 +224,18 @@ def _checks_to_make(skipped: int) -> int:
 def _by_name() -> Mapping[str, tuple[Rename, ...]]:
     """Map each old or new name to its renames."""
     two_way: dict[str, Rename] = {}
-    for vehicles, divisor, pairs in RENAMED_IN_4_7:
+    for vehicles, divisor, pairs in rename_table.RENAMED_IN_4_7:
         for old, new in _pairs(pairs):
             rename = Rename(
                 old,
                 new,
                 divisor,
-                is_inverted=old in INVERTED,
+                is_inverted=old in rename_table.INVERTED,
                 vehicles=vehicles,
-                other_new=OTHER_NEW_NAMES.get(new, ()),
+                other_new=rename_table.OTHER_NEW_NAMES.get(new, ()),
             )
             two_way.update(dict.fromkeys(rename.names, rename))
-    for since, vehicles, divisor, pairs in RENAMED_BEFORE_4_7:
+    for since, vehicles, divisor, pairs in rename_table.RENAMED_BEFORE_4_7:
         for old, new in _pairs(pairs):
             # If the new name was renamed again later, both renames become one with several old names. Its divisor is
             # that of the later rename, because the earlier one did not change the units.
@@ -252,7 +245,7 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
             two_way.update(dict.fromkeys(rename.names, rename))
     by_name: dict[str, tuple[Rename, ...]] = {name: (rename,) for name, rename in two_way.items()}
     # These renames are found only by the old name.
-    for since, vehicles, divisor, pairs in ONE_WAY:
+    for since, vehicles, divisor, pairs in rename_table.ONE_WAY:
         for old, new in _pairs(pairs):
             rename = Rename(old, new, divisor, vehicles=vehicles, since=since)
             by_name[old] = (*by_name.get(old, ()), rename)
