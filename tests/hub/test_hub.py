@@ -471,6 +471,18 @@ async def test_endpoints_are_added_and_removed() -> None:
 
 
 @virtual
+async def test_listener_added_twice_is_removed_once_by_each_function() -> None:
+    events: list[HubEvent] = []
+    async with joined(Program(1, 1), Program(255, 190)) as hub:
+        detach = hub.on_event(events.append)
+        hub.on_event(events.append)
+        detach()
+        detach()
+        await hub.remove("b")
+    assert [event.kind for event in events] == ["removed"]
+
+
+@virtual
 async def test_listener_exception_does_not_affect_the_hub(caplog: pytest.LogCaptureFixture) -> None:
     copter, station, late = Program(1, 1), Program(255, 190), Program(254, 190)
     async with joined(copter, station) as hub, late:
