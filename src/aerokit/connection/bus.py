@@ -68,7 +68,7 @@ class Bus:
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
         self.must_check_frames = False
-        """True if the owner must check frames before they are delivered. It makes :meth:`deliver_all` stop."""
+        """True if `FrameReceiver` must check each frame before it is delivered. Makes :meth:`deliver_all` stop."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}  # the key is (system id, message id)
         # Cache: system id → message id → plan. Small keys are found faster than a combination of both ids.

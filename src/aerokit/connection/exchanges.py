@@ -49,7 +49,7 @@ class ExchangeRun(Generic[ResultT]):
         """Start the exchange and return its result. Call it once."""
         try:
             self._exchange.start(self._connection.now())
-            self._after_step()
+            self._send_and_reschedule()
             await self._ended
         finally:
             self._connection.deadlines.cancel(self._expire)
@@ -59,17 +59,17 @@ class ExchangeRun(Generic[ResultT]):
         try:
             self._exchange.receive(message, self._connection.now())
         finally:  # If a callback of the program raises here, the bus logs the exception, and the exchange continues.
-            self._after_step()
+            self._send_and_reschedule()
 
     def on_link_selected(self, system_id: int, event: LinkSelected) -> None:
         is_first_choice = event.before is None
         if event.system_id == system_id and not is_first_choice:
             self._exchange.link_changed(self._connection.now())
-            self._after_step()
+            self._send_and_reschedule()
 
     def abort(self, error: Exception) -> None:
         self._exchange.abort(copy_exception(error))
-        self._after_step()
+        self._send_and_reschedule()
 
     def _expire(self) -> None:
         now = self._connection.now()
@@ -81,9 +81,9 @@ class ExchangeRun(Generic[ResultT]):
             self._exchange.expire(now)
         except Exception as error:
             self._exchange.abort(error)
-        self._after_step()
+        self._send_and_reschedule()
 
-    def _after_step(self) -> None:
+    def _send_and_reschedule(self) -> None:
         """Send the messages of the exchange, and set its next deadline or end it."""
         exchange = self._exchange
         try:

@@ -177,7 +177,8 @@ class Routes:
         # The rate needs two heartbeats with the same counters. A new framer has new counters.
         if counters is not None and route.counters is counters and frame.received_at > route.heartbeat_at:
             route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
-        route.counters, route.expected = counters, 0 if counters is None else counters.expected
+        route.counters = counters
+        route.expected = 0 if counters is None else counters.expected
         route.peer, route.sequence = peer, frame.sequence
         route.heartbeat_at = route.silent_since = frame.received_at
         return True

@@ -90,7 +90,7 @@ class SignatureFilter:
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
-        if handover is not None and is_of_handover and handover.receive(frame, self._unix_time()):
+        if handover is not None and is_of_handover and handover.is_proved_by(frame, self._unix_time()):
             self._handover = None
             self.set_signing(handover.signing)
             handover.switched.set()
@@ -163,8 +163,8 @@ class _Handover:
     def concerns(self, frame: Frame) -> bool:
         return (frame.system_id, frame.component_id) == self._source
 
-    def receive(self, frame: Frame, unix_time_s: float) -> bool:
-        """Process a frame of the component. Return True if it proves the change of the key."""
+    def is_proved_by(self, frame: Frame, unix_time_s: float) -> bool:
+        """Record a frame of the component. Return True if it proves that the component uses the new key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _is_signed_with_a_key(frame):

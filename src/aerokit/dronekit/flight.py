@@ -160,8 +160,8 @@ class FlightMethods(VehicleAttributes):
         if not abs(altitude) <= flight_orders.MAX_FLOAT:
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
-        if not aio.autopilot.repositions_amsl:
-            # ArduPilot takes the altitude above home, and stays in its mode during the take-off, so no mode is given.
+        takes_altitude_amsl = aio.autopilot.repositions_amsl
+        if not takes_altitude_amsl:  # ArduPilot, which also stays in its mode during the take-off, so none is given.
             params = (0, 0, 0, 0, 0, 0, altitude)
             return self._dk.order("takeoff", flight_orders.take_off, aio, (), MavCmd.NAV_TAKEOFF, *params)
         plan = aio.autopilot.take_off(altitude, self._dk_home_altitude(), is_vtol=aio.is_vtol)

@@ -122,6 +122,8 @@ class Listeners:
 def listener_decorator(
     add: Callable[[str, AttributeListener], object], name: str | list[str] | tuple[str, ...]
 ) -> Callable[[ListenerT], ListenerT]:
+    """Return a decorator that adds a function as a listener of one or several names."""
+
     def decorate(listener: ListenerT) -> ListenerT:
         for attribute in (name,) if isinstance(name, str) else name:
             add(attribute, listener)

@@ -572,8 +572,7 @@ class SelectionBase:
         members = self.members
         for name in names:
             if name not in members:
-                text = f"{argument}: {short_repr(name)} is not a member; members: {', '.join(members)}"
-                raise InvalidArgument(text)
+                raise InvalidArgument(f"{argument}: {short_repr(name)} is not a member; members: {', '.join(members)}")
 
     @staticmethod
     def _check_available(member: Member, action: str, consequence: str) -> None:

@@ -253,7 +253,7 @@ class _Discovery:
     async def run(self, timeout: float) -> dict[str, list[int]]:
         """Wait for the vehicles. Raises ConnectFailed or, if a link that is searched has ended, its error."""
         with ExitStack() as stack:
-            self._attach(stack)
+            self._observe_networks(stack)
             with anyio.move_on_after(timeout):
                 with warn_while_waiting(timeout, self._describe):
                     await self._wait_until_complete()
@@ -268,7 +268,7 @@ class _Discovery:
             raise ConnectFailed(f"within {timeout:g} s {self._describe()}{''.join(reasons)}")
         return {name: sorted(ids) for name, ids in self._found.items()}
 
-    def _attach(self, stack: ExitStack) -> None:
+    def _observe_networks(self, stack: ExitStack) -> None:
         for name in self._searched:
             connection = self._networks[name]
             connection.raise_if_ended()

@@ -380,12 +380,11 @@ class Missions(SelectionBase):
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:
             raise OperationRejected(f"start_missions: members not armed: {', '.join(disarmed)}; nothing was sent")
-        return await self._run(
-            "mission.start",
-            lambda member: member.vehicle.mission.start(timeout=timeout),
-            stagger_s=stagger_s,
-            names=names,
-        )
+
+        async def start(member: Member) -> None:
+            await member.vehicle.mission.start(timeout=timeout)
+
+        return await self._run("mission.start", start, stagger_s=stagger_s, names=names)
 
     async def wait_missions_finished(self, *, timeout: float | None = None) -> FleetResult:
         """Wait until each member has finished its mission; see ``vehicle.mission.wait_finished``.

@@ -88,14 +88,14 @@ class Sender:
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:
         """Record a frame at another port than `port_number`. Return True if the routes change."""
-        is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
+        is_new_there = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
         if must_move or now - self.received_at > ROUTE_TIMEOUT_S:
             # If the sender is silent at its present port, messages go to the new port.
             self.ports[self.port_number] = self.received_at
             self.port_number, self.received_at = number, now
             return True
-        return is_new
+        return is_new_there
 
     def exclude_pause(self, now: float, paused_s: float) -> None:
         """Do not count the last ``paused_s`` seconds as silence."""

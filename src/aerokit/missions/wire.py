@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink import messages
@@ -27,23 +27,8 @@ def to_wire(
     current: bool = False,
 ) -> messages.MissionItemInt:
     """Convert an item to MISSION_ITEM_INT. Its ``x`` and ``y`` must be integers."""
-    return messages.MissionItemInt(
-        target_system=target_system,
-        target_component=target_component,
-        seq=seq,
-        frame=int(item.frame),
-        command=int(item.command),
-        current=int(current),
-        autocontinue=int(item.autocontinue),
-        param1=item.param1,
-        param2=item.param2,
-        param3=item.param3,
-        param4=item.param4,
-        x=item.x,  # type: ignore[arg-type]
-        y=item.y,  # type: ignore[arg-type]
-        z=item.z,
-        mission_type=mission_type,
-    )
+    common = _common_fields(item, seq, target_system, target_component, mission_type, current)
+    return messages.MissionItemInt(x=item.x, y=item.y, **common)  # type: ignore[arg-type]
 
 
 def to_wire_float(
@@ -62,23 +47,28 @@ def to_wire_float(
     values.
     """
     x, y = unscaled_xy(item) if place is None else place
-    return messages.MissionItem(
-        target_system=target_system,
-        target_component=target_component,
-        seq=seq,
-        frame=int(item.frame),
-        command=int(item.command),
-        current=int(current),
-        autocontinue=int(item.autocontinue),
-        param1=item.param1,
-        param2=item.param2,
-        param3=item.param3,
-        param4=item.param4,
-        x=x,
-        y=y,
-        z=item.z,
-        mission_type=mission_type,
-    )
+    common = _common_fields(item, seq, target_system, target_component, mission_type, current)
+    return messages.MissionItem(x=x, y=y, **common)
+
+
+def _common_fields(
+    item: MissionItem, seq: int, target_system: int, target_component: int, mission_type: int, current: int
+) -> dict[str, Any]:
+    return {
+        "target_system": target_system,
+        "target_component": target_component,
+        "seq": seq,
+        "frame": int(item.frame),
+        "command": int(item.command),
+        "current": int(current),
+        "autocontinue": int(item.autocontinue),
+        "param1": item.param1,
+        "param2": item.param2,
+        "param3": item.param3,
+        "param4": item.param4,
+        "z": item.z,
+        "mission_type": mission_type,
+    }
 
 
 def from_wire(message: messages.MissionItemInt | messages.MissionItem) -> MissionItem:
