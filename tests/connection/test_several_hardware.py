@@ -185,9 +185,8 @@ class Answers:
             self.now += 0.5
             for link in links or (0, 1):
                 self.choice.record_heartbeat(link, self.now, is_costly=False)
-                if self.choice.should_request_hardware(
-                    candidate := self.choice.candidates[link], has_vehicle_object=True
-                ):
+                candidate = self.choice.candidates[link]
+                if self.choice.should_request_hardware(candidate, has_vehicle_object=True):
                     candidate.count_hardware_request()
                 self.choice.record_answer(link, ClockSample(self.now, self.now + ahead_s, 0.01), self.now)
             self.choice.choose(self.now)

@@ -189,9 +189,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument("program", metavar="PROGRAM", help="a file, or a folder or zip file with a __main__.py")
     sim = parser.add_argument_group("a vehicle for the program")
     sim.add_argument(
-        "--sim",
-        action="store_true",
-        help="serve a simulated vehicle on tcp:127.0.0.1:5760 and UDP port 14550",
+        "--sim", action="store_true", help="serve a simulated vehicle on tcp:127.0.0.1:5760 and UDP port 14550"
     )
     sim.add_argument(
         "--vehicle", default="copter", metavar="KIND", help="copter, plane, rover, sub, px4 … (default: copter)"
