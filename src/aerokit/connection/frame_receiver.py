@@ -204,6 +204,7 @@ class FrameReceiver:
             self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
+        # Suspects are frames out of order, and those that may be of a second sender with the same ids.
         has_suspects = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # A sink of an earlier frame has closed the connection.

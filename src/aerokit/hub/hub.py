@@ -141,9 +141,8 @@ class Hub:
         self._raise_unless_open()
         endpoint = self._running_endpoints.pop(name, None)
         if endpoint is None:
-            raise InvalidArgument(
-                f"no endpoint is named {name!r}; endpoints: {', '.join(self._running_endpoints) or 'none'}"
-            )
+            present = ", ".join(self._running_endpoints) or "none"
+            raise InvalidArgument(f"no endpoint is named {name!r}; endpoints: {present}")
         endpoint.close()
         self._report(endpoint, "removed", f"{name} was removed")
         await _wait_until_closed([endpoint])
