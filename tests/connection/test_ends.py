@@ -191,7 +191,7 @@ def break_framer(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def break_rates(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle._session.rates, "_watch", broken)
+    monkeypatch.setattr(vehicle._session.rates, "_check_stream", broken)
 
 
 def break_link_watch(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
