@@ -200,7 +200,7 @@ def test_log_stop_repeats_while_vehicle_sends() -> None:
 
 
 def test_already_sent_log_stop_is_not_sent() -> None:
-    exchange = LogStop(1, 1, is_sent=True)
+    exchange = LogStop(1, 1, is_sent_by_caller=True)
     exchange.start(0.0)
     assert exchange.take_outbox() == []
 

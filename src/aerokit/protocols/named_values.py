@@ -185,7 +185,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _timeout_text(self, name: str) -> str:
         return f"{name} was not answered, requested {self._window.attempts(name)} times"
 
-    def _check_overdue(self, now: float) -> None: ...
+    def _process_overdue(self, now: float) -> None: ...
 
     def _send_probe_if_wanted(self, now: float) -> None: ...
 
@@ -196,7 +196,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
     def _proceed(self, now: float) -> None:
         if len(self._results) < len(self._names):
-            self._check_overdue(now)  # This call may set the last results.
+            self._process_overdue(now)  # This call may set the last results.
         if len(self._results) == len(self._names):
             self._finish({name: self._results[name] for name in self._names})
             return
@@ -237,7 +237,7 @@ class NamedReads(NamedRequests[ValueT]):
             self._outbox += self._request(PROBE)
         self._is_probe_wanted = False
 
-    def _count_probe(self) -> None:
+    def _count_probe_answer(self) -> None:
         # There cannot be more answers than requests, so further answers are duplicates.
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 

@@ -136,17 +136,17 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
 
-    def _check_overdue(self, now: float) -> None:
+    def _process_overdue(self, now: float) -> None:
         if self._may_probe and (overdue := self._overdue(now)):
             self._reject_if_requested_often(overdue, now)
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        # An answer to another station also counts. This does no harm, because a name is rejected only after several
-        # probes (see `_loss_probability`).
+        # The probe requests index 0, which every vehicle has. An answer to another station also counts. This does no
+        # harm, because a name is rejected only after several probes (see `_loss_probability`).
         is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
         if is_probe_answer:
-            self._count_probe()
+            self._count_probe_answer()
             lost = self._window.on_answer(PROBE, now, loss_threshold=1)
             if lost:
                 self._reject_if_requested_often(lost, now)
@@ -228,17 +228,17 @@ class ParameterWrites(ParameterRequests):
             **options,
         )
         self._before = dict(before)
-        self._recently_written = set(recent)
-        self._may_be_late = frozenset(self._recently_written)  # names whose earlier values may arrive late
-        self._to_set = set(self._requested)  # names whose next request is a PARAM_SET
+        self._recently_written = frozenset(recent)
+        self._must_read_again = set(self._recently_written)
+        self._must_write = set(self._requested)  # names whose next request is a PARAM_SET
         self._repeated_answers: dict[str, RepeatedAnswers[Parameter]] = {}
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
-        if name not in self._to_set:
+        if name not in self._must_write:
             return [read]
-        self._to_set.remove(name)
+        self._must_write.remove(name)
         requested = self._requested[name]
         write = set_message(
             self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
@@ -258,10 +258,10 @@ class ParameterWrites(ParameterRequests):
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         answers = self._repeated_answers.setdefault(name, RepeatedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
-        if is_as_requested and name in self._recently_written:
+        if is_as_requested and name in self._must_read_again:
             # The message may be the late answer to a write of this name by an earlier call, so the value is read once
             # more.
-            self._recently_written.remove(name)
+            self._must_read_again.remove(name)
             answers.add(reported)
             self._window.on_answer(name, now)
             self._window.request(name)
@@ -274,23 +274,23 @@ class ParameterWrites(ParameterRequests):
         self._on_unexpected_value(name, reported, now, is_as_requested=is_as_requested)
 
     def _on_unexpected_value(self, name: str, reported: Parameter, now: float, *, is_as_requested: bool) -> None:
-        """Write or read again, unless enough equal answers have arrived.
+        """Write or read again. Enough equal answers end the write instead.
 
         With ``is_as_requested``, only the type of the value is unexpected.
         """
         answers = self._repeated_answers[name]
         sent_at = self._sent_at.get(name, now)
-        if self._stale_answers.refuses(name, sent_at, now, attempts=self._window.attempts(name)):
+        if self._stale_answers.is_stale(name, sent_at, now, attempts=self._window.attempts(name)):
             return
         answers.add(reported)
         before = self._before.get(name)  # None if unknown
         may_be_unchanged = before is None or same_value(reported.value, before)
         if may_be_unchanged and not is_as_requested:
-            self._to_set.add(name)  # The vehicle may still have the old value, so PARAM_SET is sent again.
+            self._must_write.add(name)  # The vehicle may still have the old value, so PARAM_SET is sent again.
         is_conclusive = answers.are_conclusive(is_unchanged=may_be_unchanged)
-        may_be_late = may_be_unchanged or name in self._may_be_late
+        may_be_late = may_be_unchanged or name in self._recently_written
         if is_conclusive and may_be_late and now < self._started_at + LATE_ANSWERS_S:
-            return  # The request is repeated when it is overdue.
+            return  # These answers may be older than the write. The request is repeated when it is overdue.
         self._window.on_answer(name, now)
         if is_conclusive:
             self._set_result(name, reported, now)

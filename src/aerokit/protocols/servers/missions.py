@@ -252,7 +252,7 @@ class MissionServer:
 
     def _request_first_item(self, upload: ListUpload) -> None:
         self._request_item(upload)
-        self._watch(upload)
+        self._schedule_check(upload)
 
     def _drop(self, upload: ListUpload) -> None:
         """End an upload without an answer to the client."""
@@ -268,7 +268,7 @@ class MissionServer:
         request_class = m.MissionRequestInt if upload.uses_int else m.MissionRequest
         self._host.send(request_class(*upload.client, upload.next, upload.mission_type), upload.channel)
 
-    def _watch(self, upload: ListUpload) -> None:
+    def _schedule_check(self, upload: ListUpload) -> None:
         """Schedule the next retry or the time-out."""
         due = min(upload.requested_at + self.retry_interval_s, upload.received_at + self.timeout_s)
         self._host.call_at(due, lambda: self._check(upload))
@@ -282,7 +282,7 @@ class MissionServer:
             return
         if self._host.now >= upload.requested_at + self.retry_interval_s:
             self._repeat(upload)
-        self._watch(upload)
+        self._schedule_check(upload)
 
     def _is_running(self, upload: ListUpload) -> bool:
         return self._uploads.get(self._key(upload.mission_type)) is upload
@@ -328,7 +328,7 @@ class MissionServer:
     def _finish(self, upload: ListUpload) -> None:
         upload.is_being_validated = True
 
-        def answer(result: int) -> None:
+        def answer(result: int) -> None:  # `validate` may call it now or later.
             if self._is_running(upload):
                 if result == _Result.ACCEPTED:
                     self.store(upload.mission_type, upload.items)
@@ -371,7 +371,7 @@ class MissionServer:
             return
         kind, *other_kinds = kinds
 
-        def answer(result: int) -> None:
+        def answer(result: int) -> None:  # `validate` may call it now or later.
             if result == _Result.ACCEPTED and self._clearing is request:
                 self.store(kind, ())
                 self._clear(other_kinds, request, channel)

@@ -137,7 +137,7 @@ class Px4MissionServer(MissionServer):
             self._link(channel), state=state, client=client, mission_type=kind, next=0, end=count, received_at=now
         )
         self._links[channel] = link
-        self._watch(link)
+        self._schedule_check(link)
         return link
 
     def _drop(self, upload: ListUpload) -> None:
@@ -165,7 +165,7 @@ class Px4MissionServer(MissionServer):
             message = item_message_float(downloaded, place, seq, client, kind, int(is_current))
         self._px4.send(message, link.channel)
 
-    def _watch(self, upload: ListUpload) -> None:
+    def _schedule_check(self, upload: ListUpload) -> None:
         due = upload.received_at + self.timeout_s
         if self._link(upload.channel).is_retried:
             due = min(due, self._px4.now + self.retry_interval_s)
