@@ -190,7 +190,7 @@ class ReconnectingLink(Link):
             self._receiver.bytes_received(data, peer)
 
     def _on_lost(self, current: _CurrentReceiver, error: LinkLost) -> None:
-        if current is not self._current:
+        if current is not self._current:  # This link was replaced already.
             return
         self._is_up = False
         self._cancel_stable_timer()

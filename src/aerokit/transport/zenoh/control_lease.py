@@ -180,7 +180,7 @@ class ClientFilter:
                 reason = "this link is read-only (control=never)"
             else:
                 reason = f"{holder} has control"
-            notices += self._refuse(frame, _decoded(frame), reason, holder, now)
+            notices += self._refuse(frame, reason, now, holder=holder)
         return b"".join(accepted), notices
 
     def _has_name_conflict(self, nonce: int, mode: ControlMode, now: float) -> bool:
@@ -199,21 +199,15 @@ class ClientFilter:
             if is_read_only(frame):
                 self.refused += 1
             else:
-                notices += self._refuse(frame, _decoded(frame), "it arrived too late", None, now, is_late=True)
+                notices += self._refuse(frame, "it arrived too late", now, is_late=True)
         return notices
 
     def _refuse(
-        self,
-        frame: Frame,
-        message: Message | None,
-        reason: str,
-        holder: str | None,
-        now: float,
-        *,
-        is_late: bool = False,
+        self, frame: Frame, reason: str, now: float, *, holder: str | None = None, is_late: bool = False
     ) -> list[RefusalNotice]:
         """Count a refused frame. Return a notice, or nothing if one about this message was sent a moment ago."""
         self.refused += 1
+        message = _decoded(frame)
         name = f"message {frame.message_id}" if message is None else message.NAME
         # A late command gets no answer, because the client may have sent it again. The client would take an answer to
         # the first transmission for an answer to the second one.

@@ -190,7 +190,7 @@ class ZenohListen(NetworkLink):
             return
         client.received_at = now
         stamp = Stamp.decode(attachment)
-        if not self._freshness.is_fresh(stamp, now) or stamp is None:
+        if not self._freshness.is_fresh(stamp, now) or stamp is None:  # Without a stamp, the datagram counts as late.
             self._send_notices(name, client.refuse_late(data, now), stamp)
             return
         # Do not tell the client that a duplicate or overtaken datagram was refused: the first copy or a newer datagram
