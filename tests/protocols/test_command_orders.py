@@ -184,7 +184,7 @@ def test_unrepeatable_order_ends_with_its_effect() -> None:
 
 
 def test_already_sent_order_is_not_sent_on_start() -> None:
-    machine = order(is_sent_by_caller=True)
+    machine = order(sent_by_caller=True)
     assert machine.take_outbox() == []
     machine.expire(1.0)
     assert confirmations(machine) == [1]

@@ -197,7 +197,7 @@ class CommandExchange(Exchange[CommandAck]):
         acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: determines whether the command may be repeated; None if nothing prevents it.
-        is_sent_by_caller: True if the caller makes the first transmission. The exchange only repeats the command.
+        sent_by_caller: True if the caller makes the first transmission. The exchange only repeats the command.
 
     Raises from ``result()``:
         CommandRejected: the result is neither ACCEPTED nor IN_PROGRESS. The caller adds status texts of the vehicle.
@@ -225,7 +225,7 @@ class CommandExchange(Exchange[CommandAck]):
         acks_per_sending: int = 1,
         min_timeout_s: float = 0.0,
         order_status: OrderStatus | None = None,
-        is_sent_by_caller: bool = False,
+        sent_by_caller: bool = False,
     ) -> None:
         super().__init__()
         default_timeout_s = ATTEMPT_TIMEOUT_S
@@ -248,7 +248,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._progress_timeout, self._on_progress = progress_timeout, on_progress
         self._earlier_acks, self._acks_per_sending = earlier_acks, acks_per_sending
         self._order_status = order_status
-        self._is_sent_by_caller = is_sent_by_caller
+        self._sent_by_caller = sent_by_caller
         self._sent_count = 0  # number of transmissions, including a first one by the caller
         self._dropped_count = 0  # number of these transmissions that no link accepted
         self.final_acks: int = 0
@@ -258,7 +258,7 @@ class CommandExchange(Exchange[CommandAck]):
     def start(self, now: float) -> None:
         self._started_at = now
         self._send(now)
-        if self._is_sent_by_caller:
+        if self._sent_by_caller:
             self._outbox.clear()
 
     def receive(self, message: Message, now: float) -> None:

@@ -304,7 +304,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     Args:
         path: used in error texts.
-        is_sent_by_caller: True if the caller makes the first transmission. The exchange only repeats the request.
+        sent_by_caller: True if the caller makes the first transmission. The exchange only repeats the request.
     """
 
     attempts: int
@@ -321,7 +321,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
         session: int = 0,
         offset: int = 0,
         data: bytes = b"",
-        is_sent_by_caller: bool = False,
+        sent_by_caller: bool = False,
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(client, path, **options)
@@ -330,7 +330,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
         self._request = FtpMessage(
             client.next_sequence(), opcode, session=session, size=len(data), offset=offset, data=data
         )
-        self._is_sent_by_caller = is_sent_by_caller
+        self._sent_by_caller = sent_by_caller
         self._renumbered = 0  # number of times the request got a new sequence number
 
     @property
@@ -351,10 +351,10 @@ class FtpRequest(FtpExchange[FtpMessage]):
         return self._result is not None
 
     def start(self, now: float) -> None:
-        """Start the exchange: send the request, unless the caller sends it (``is_sent_by_caller``)."""
+        """Start the exchange: send the request, unless the caller sends it (``sent_by_caller``)."""
         self._start_clock(now)
         self._transmit(now)
-        if self._is_sent_by_caller:
+        if self._sent_by_caller:
             self._outbox.clear()
 
     def expire(self, now: float) -> None:

@@ -226,35 +226,19 @@ class LogDownload(Transfer[int]):
 
 
 class LogStop(Transfer[None]):
-    """Sends LOG_REQUEST_END, which is not acknowledged, until the vehicle sends no more log data.
+    """Repeats LOG_REQUEST_END, which is not acknowledged, until the vehicle sends no more log data.
 
-    Args:
-        is_sent_by_caller: True if the caller itself makes the first transmission.
+    The caller sends the first one (`message`).
     """
 
     expects: tuple[type[Message], ...] = (LogData, LogEntry)
-
-    def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        *,
-        is_sent_by_caller: bool = False,
-        **options: Unpack[TransferOptions],
-    ) -> None:
-        super().__init__(target_system, target_component, **options)
-        self._is_sent_by_caller = is_sent_by_caller
-        self._is_receiving = False
 
     @property
     def message(self) -> LogRequestEnd:
         return LogRequestEnd(self.target_system, self.target_component)
 
     def start(self, now: float) -> None:
-        """Send the request, unless ``is_sent_by_caller``."""
         self._start_clock(now)
-        if not self._is_sent_by_caller:
-            self._outbox.append(self.message)
         self._wait(now)
 
     def receive(self, message: Message, now: float) -> None:

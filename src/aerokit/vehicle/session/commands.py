@@ -263,7 +263,7 @@ class CommandSender:
                 earlier_acks=len(pending_acks),
                 acks_per_sending=acks_per_sending,
                 order_status=order_status,
-                is_sent_by_caller=was_just_sent,
+                sent_by_caller=was_just_sent,
             )
             run = ExchangeRun(self._connection, exchange)
             self._runs[key] = run
