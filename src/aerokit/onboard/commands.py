@@ -148,11 +148,11 @@ class ComponentCommands:
         A command for which ``is_stop`` returns True cancels a running handler. Raises InvalidArgument if the command
         already has a handler, or an annotation of the function is not supported.
         """
+        arguments = arguments_of(function)
 
         def execute(received: ReceivedCommand) -> None:
             self._execute(function, arguments, received, is_stop=is_stop(received))
 
-        arguments = arguments_of(function)
         self._register({command: execute})
 
     def _register(self, handlers: Mapping[int, CommandHandler]) -> None:

@@ -127,9 +127,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         opaque_id = message.opaque_id
         if self._count is None:
             # PX4, whose window is 1, repeats MISSION_COUNT by itself, so its arrival does not measure the round trip.
-            may_be_repeated = self._window == 1
-            is_first_request = self._attempt == 1 and not self._restarts
-            if is_first_request and not may_be_repeated:
+            if self._attempt == 1 and not self._restarts and self._window > 1:
                 self.round_trip.add_sample(now - self._list_requested_at)
             # After a restart, the items received before stay valid only if the plan has the same id.
             if not opaque_id or opaque_id != self._opaque_id:

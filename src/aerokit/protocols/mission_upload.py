@@ -204,13 +204,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _on_ack(self, ack: MissionAck, now: float) -> None:
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
-            # Before all items were sent, an ACCEPTED can only answer an earlier upload.
-            if self._vehicle_has_requested and self._sent_end == self._end:
-                # We may send the last item before the vehicle requests it. Until the vehicle does, an ACCEPTED may be a
-                # delayed answer to an earlier upload.
-                was_last_requested = self._confirmed_end == self._end - 1
-                is_confirmed = was_last_requested and not self._was_tail_repeated
-                self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
+            self._on_accepted(ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._vehicle_has_requested:
                 # The vehicle answers so if it already has the item, or if a preceding item is missing.
@@ -223,6 +217,15 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._on_error(now)
         else:
             self._fail_as_refused(result)
+
+    def _on_accepted(self, opaque_id: int, now: float) -> None:
+        # Before all items were sent, an ACCEPTED can only answer an earlier upload.
+        if self._vehicle_has_requested and self._sent_end == self._end:
+            # We may send the last item before the vehicle requests it. Until the vehicle does, an ACCEPTED may be a
+            # delayed answer to an earlier upload.
+            was_last_requested = self._confirmed_end == self._end - 1
+            is_confirmed = was_last_requested and not self._was_tail_repeated
+            self._succeed(now, is_confirmed=is_confirmed, opaque_id=opaque_id)
 
     def _on_error(self, now: float) -> None:
         # ERROR need not mean that the upload has failed. PX4 also sends it when it is busy, when MISSION_COUNT arrives

@@ -144,13 +144,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     def _on_value(self, message: ParamValue, now: float) -> None:
         # The probe requests index 0, which every vehicle has. An answer to another station also counts. This does no
         # harm, because a name is rejected only after several probes (see `_loss_probability`).
-        is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
-        if is_probe_answer:
-            self._count_probe_answer()
-            lost = self._window.on_answer(PROBE, now, loss_threshold=1)
-            if lost:
-                self._reject_if_requested_often(lost, now)
-                self._is_probe_wanted = True
+        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0:
+            self._on_probe_answer(now)
         name = message.param_id
         if name and name in self._window:
             self._window.on_answer(name, now)
@@ -161,6 +156,13 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             else:
                 self._set_result(name, reported, now)
                 self._reject_alternatives(name, now)
+
+    def _on_probe_answer(self, now: float) -> None:
+        self._count_probe_answer()
+        unanswered = self._window.on_answer(PROBE, now, loss_threshold=1)  # all names requested before the probe
+        if unanswered:
+            self._reject_if_requested_often(unanswered, now)
+            self._is_probe_wanted = True
 
     def _reject_alternatives(self, name: str, now: float) -> None:
         for alternative in self._alternatives.get(name, ()):

@@ -295,35 +295,38 @@ TYPE_VARIABLES = {"ItemT": '"Message | Event"', "MessageT": '"Message"', "Setpoi
 
 
 def generate(name: str = "twins") -> str:
+    """Return the source of one of `FILES`."""
     page = Page(name)
     twins = [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
-    exports = [twin.name for twin in twins]
-    # `_class` and `_opener` have added the imports that their code needs. The following imports are needed in any case.
-    page.run_time_imports |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
-    page.run_time_imports |= {OPENERS[name], ("aerokit._internal.arguments", "checked")}
-    page.typing_imports |= {
-        (twin.module, f"{twin.name} as Async{twin.name}") for twin in twins if twin.base in GENERIC_BASES
-    }
+    _add_common_imports(page, twins)
     variables = TYPE_VARIABLES if name == "twins" else {}
-    page.typing_imports |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
-    for path in FUNCTIONS[name]:
-        module, _, function_name = path.rpartition(".")
-        page.run_time_imports.add((module, f"{function_name} as {function_name}_async"))
-        exports.append(function_name)
-    page.typing_imports -= page.run_time_imports
     # Imports in HEAD that this file does not use are left out.
-    text = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
+    head = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
     if "@cached_property" not in "".join(classes):
-        text = text.replace("from functools import cached_property\n", "")
-    head = text + _import_lines(page.run_time_imports, "") + "\nif TYPE_CHECKING:\n"
+        head = head.replace("from functools import cached_property\n", "")
+    head += _import_lines(page.run_time_imports, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.typing_imports, "    ") + "\n"
+    exports = [*(twin.name for twin in twins), *(path.rpartition(".")[2] for path in FUNCTIONS[name])]
     head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in sorted(exports)) + "]\n"
     head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'
     return head + "\n\n" + "\n\n".join([*classes, *functions])
+
+
+def _add_common_imports(page: Page, twins: Sequence[Twin]) -> None:
+    """Add the imports that the file needs besides those that `_class` and `_opener` have added."""
+    page.run_time_imports |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
+    page.run_time_imports |= {OPENERS[page.name], ("aerokit._internal.arguments", "checked")}
+    for path in FUNCTIONS[page.name]:
+        module, _, function_name = path.rpartition(".")
+        page.run_time_imports.add((module, f"{function_name} as {function_name}_async"))
+    generic_twins = [twin for twin in twins if twin.base in GENERIC_BASES]
+    page.typing_imports |= {(twin.module, f"{twin.name} as Async{twin.name}") for twin in generic_twins}
+    page.typing_imports |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
+    page.typing_imports -= page.run_time_imports
 
 
 def _class(page: Page, twin: Twin) -> str:

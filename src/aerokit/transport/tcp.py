@@ -250,7 +250,7 @@ class TcpListen(_TcpLink):
         if len(self._clients) < MAX_CLIENTS:
             return True
         unkept = next((peer for peer in self._clients if peer not in self._kept), None)
-        if not self._keeps_peers or unkept is None:
+        if not self._keeps_peers or unkept is None:  # Without a `PeerKeeper`, every client counts as kept.
             return False
         self._clients.pop(unkept).close()
         if isinstance(self._receiver, PeerListener):

@@ -131,7 +131,7 @@ class MissionServer:
         self._uploads.clear()
         self._clearing = None
 
-    def id(self, mission_type: int) -> int:
+    def opaque_id(self, mission_type: int) -> int:
         """Return the opaque id of a list, a checksum of its items. It is 0 for an empty list."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
@@ -144,8 +144,9 @@ class MissionServer:
 
     def current_message(self) -> m.MissionCurrent:
         return m.MissionCurrent(
-            seq=self.current, total=self.count(MavMissionType.MISSION), mission_id=self.id(MavMissionType.MISSION),
-            fence_id=self.id(MavMissionType.FENCE), rally_points_id=self.id(MavMissionType.RALLY),
+            seq=self.current, total=self.count(MavMissionType.MISSION),
+            mission_id=self.opaque_id(MavMissionType.MISSION), fence_id=self.opaque_id(MavMissionType.FENCE),
+            rally_points_id=self.opaque_id(MavMissionType.RALLY),
         )  # fmt: skip
 
     def store(self, mission_type: int, items: Sequence[MissionItem]) -> None:
@@ -204,7 +205,7 @@ class MissionServer:
         if (refusal := self._refusal(request, channel)) is not None:
             self._acknowledge(to, kind, refusal, channel)
         else:
-            self._host.send(m.MissionCount(*to, self.count(kind), kind, opaque_id=self.id(kind)), channel)
+            self._host.send(m.MissionCount(*to, self.count(kind), kind, opaque_id=self.opaque_id(kind)), channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         refusal = self._refusal(request, channel)
@@ -260,7 +261,7 @@ class MissionServer:
 
     def _end(self, upload: ListUpload, result: int) -> None:
         self._drop(upload)
-        opaque_id = self.id(upload.mission_type) if result == _Result.ACCEPTED else 0
+        opaque_id = self.opaque_id(upload.mission_type) if result == _Result.ACCEPTED else 0
         self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
 
     def _request_item(self, upload: ListUpload) -> None:
