@@ -244,7 +244,7 @@ class BaseLink(Link):
         if self._receiver is not None:
             self._receiver.bytes_received(data, peer)
 
-    def _drop(self, writes: int) -> None:
+    def _count_dropped(self, writes: int) -> None:
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:

@@ -106,7 +106,7 @@ class ZenohListen(NetworkLink):
         elif peer in self._clients:
             self._put(self._keys.from_server(str(peer)), bytes(data), attachment)
         else:
-            self._drop(1)
+            self._count_dropped(1)
 
     def has_peer(self, peer: Peer) -> bool:
         return peer in self._clients
@@ -267,7 +267,7 @@ class ZenohListen(NetworkLink):
         try:
             put()
         except Exception:  # zenoh raises various errors after its session has ended.
-            self._drop(1)
+            self._count_dropped(1)
 
 
 def _client_of(sample: Any) -> str:
