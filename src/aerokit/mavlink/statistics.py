@@ -133,7 +133,7 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._skipped_over = ahead
         missing_bits = ((1 << ahead) - 1) << 1  # bit 0 is this frame
-        self._missing = self._shifted(ahead + 1) | missing_bits & _WINDOW
+        self._missing = self._missing_shifted(ahead + 1) | missing_bits & _WINDOW
         self.skip(ahead)
         self.expected += 1
         self._missing_base = self.expected
@@ -146,14 +146,14 @@ class SourceStatistics(SourceFields):
         self._stream_start = self.received
         self._returns = self._skipped_over = 0
 
-    def _shifted(self, advance: int) -> int:
+    def _missing_shifted(self, advance: int) -> int:
         """Return the bits of `_missing` for a `_missing_base` of `expected` + ``advance``."""
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _consume_missing(self, behind: int) -> bool:
         """Mark the frame ``behind`` places before `expected` as received. Return True if it was missing."""
-        self._missing, self._missing_base = self._shifted(0), self.expected
+        self._missing, self._missing_base = self._missing_shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
         self._missing &= ~bit

@@ -203,6 +203,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_ack(self, ack: MissionAck, now: float) -> None:
         result = ack.type
+        # Before the vehicle requests an item, ERROR refuses a partial upload. In other cases it has several meanings.
+        is_refusal = self.is_partial and not self._vehicle_has_requested
         if result == MavMissionResult.ACCEPTED:
             self._on_accepted(ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
@@ -213,7 +215,7 @@ class MissionUpload(MissionExchange[UploadResult]):
                     self._wait(now)
         elif result == MavMissionResult.OPERATION_CANCELLED:
             self._restart(result, now)
-        elif result == MavMissionResult.ERROR and (self._vehicle_has_requested or not self.is_partial):
+        elif result == MavMissionResult.ERROR and not is_refusal:
             self._on_error(now)
         else:
             self._fail_as_refused(result)

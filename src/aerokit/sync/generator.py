@@ -108,9 +108,9 @@ def _lines(arguments: Sequence[str], indent: str) -> str:
     lines = ""
     for argument in arguments:
         # Like ruff, break a line that is too long before `| None`.
-        head, none, tail = argument.rpartition(" | None")
-        if none and len(indent) + len(argument) + 1 > WIDTH:
-            argument = f"{head}\n{indent}{none.lstrip()}{tail}"
+        head, separator, tail = argument.rpartition(" | None")
+        if separator and len(indent) + len(argument) + 1 > WIDTH:
+            argument = f"{head}\n{indent}{separator.lstrip()}{tail}"
         lines += f"{indent}{argument},\n"
     return lines
 

@@ -99,8 +99,8 @@ class SerialLink(BaseLink):
         # can be discarded.
         self._transport.set_write_buffer_limits(high=0)
         self._outbox = Outbox(
-            self._transport.write,
-            partial(self._unsent_bytes_of, self._transport),
+            send=self._transport.write,
+            pending_bytes=partial(self._unsent_bytes_of, self._transport),
             limit=limit,
             on_dropped=self._count_dropped,
             on_stalled=self._report_stalled,

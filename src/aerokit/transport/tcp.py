@@ -342,8 +342,8 @@ class _Stream(asyncio.Protocol):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, NOT_SENT_LOW_WATER)
         self._fd = sock.fileno()
         self._outbox = Outbox(
-            transport.write,
-            self._pending_bytes,
+            send=transport.write,
+            pending_bytes=self._pending_bytes,
             limit=MAX_PENDING_BYTES,
             on_dropped=self._link._count_dropped,
             on_stalled=lambda is_stalled: self._link._on_stalled(self, is_stalled),
