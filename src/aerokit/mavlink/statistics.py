@@ -321,7 +321,7 @@ class FramerStatistics(CounterFields):
         """Like :attr:`sources`, but the key is system id + 256 · component id."""
         return self._by_key
 
-    def add_source(self, key: int, sequence: int, *, has_room: bool) -> SourceStatistics:
+    def add_source(self, key: int, sequence: int, has_room: bool) -> SourceStatistics:
         """Create the counters of a new sender. They are stored only if ``has_room`` is True."""
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
         if has_room:

@@ -205,7 +205,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     def _proceed(self, now: float) -> None:
         if len(self._items) >= len(self._indices):
-            self._end()
+            self._acknowledge_and_finish()
             return
         while self._next_position < len(self._indices) and len(self._requested_at) < self._window:
             seq = self._indices[self._next_position]
@@ -235,7 +235,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     # ------------------------------------------------------------------------------------ end
 
-    def _end(self) -> None:
+    def _acknowledge_and_finish(self) -> None:
         # If PX4 (window 1) misses the acknowledgement, it accepts no upload for 5 s. PX4 therefore gets two of them.
         transmissions = 2 if self._window == 1 else 1
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions

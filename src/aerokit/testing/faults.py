@@ -15,7 +15,7 @@ from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
 # Calls its argument, a function that schedules faults, with the scheduler of the flight.
-WithScheduler = Callable[[Callable[[FlightScheduler], None]], None]
+ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
 class FaultInjector:
@@ -28,9 +28,9 @@ class FaultInjector:
     # With slots, an attempt to set an attribute of `Faults` here raises AttributeError instead of having no effect.
     __slots__ = ("_vehicle", "_with_scheduler")
 
-    def __init__(self, vehicle: Any, with_scheduler: WithScheduler) -> None:
+    def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:
         self._vehicle = vehicle
-        self._with_scheduler = with_scheduler
+        self._with_scheduler = schedule_with
 
     def when(self, condition: Callable[[TrackPoint], bool]) -> FaultInjector:
         """Return an injector that starts its faults when the true state of the vehicle first meets a condition.
