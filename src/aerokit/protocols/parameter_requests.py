@@ -73,6 +73,10 @@ class ParameterRequests(NamedRequests[Parameter]):
     @abstractmethod
     def _on_value(self, message: ParamValue, now: float) -> None: ...
 
+    def _request_again(self, name: str, now: float) -> None:
+        self._window.on_answer(name, now)
+        self._window.request(name)
+
     def _on_error(self, message: ParamError, now: float) -> None:
         name = message.param_id  # The index and the target ids are not used, because PX4 does not initialise them.
         if name in self._names and name in self._window:
@@ -148,12 +152,12 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._on_probe_answer(now)
         name = message.param_id
         if name and name in self._window:
-            self._window.on_answer(name, now)
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # A delayed message may contain the old value, so we read once more.
+                self._request_again(name, now)  # A delayed message may contain the old value.
             else:
+                self._window.on_answer(name, now)
                 self._set_result(name, reported, now)
                 self._reject_alternatives(name, now)
 
@@ -176,8 +180,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         is_first = name in self._names and name in self._window and name not in self._refused_once
         if is_first and message.error == MavParamError.DOES_NOT_EXIST:
             self._refused_once.add(name)
-            self._window.on_answer(name, now)
-            self._window.request(name)
+            self._request_again(name, now)
         else:
             super()._on_error(message, now)
 
@@ -265,8 +268,7 @@ class ParameterWrites(ParameterRequests):
             # more.
             self._must_read_again.remove(name)
             answers.add(reported)
-            self._window.on_answer(name, now)
-            self._window.request(name)
+            self._request_again(name, now)
             return
         # The requested value with another type is accepted when it is reported a second time.
         if is_as_requested and (reported.type == requested.type or answers.ends_with(reported)):
@@ -293,11 +295,11 @@ class ParameterWrites(ParameterRequests):
         may_be_late = may_be_unchanged or name in self._recently_written
         if is_conclusive and may_be_late and now < self._started_at + LATE_ANSWERS_S:
             return  # These answers may be older than the write. The request is repeated when it is overdue.
-        self._window.on_answer(name, now)
         if is_conclusive:
+            self._window.on_answer(name, now)
             self._set_result(name, reported, now)
         else:
-            self._window.request(name)
+            self._request_again(name, now)
 
     def _with_integer_type(self, reported: Parameter, type_: ParameterType) -> Parameter:
         # If the value is the default, ArduPilot's answer to PARAM_SET reports an integer parameter as a float.
