@@ -15,7 +15,6 @@ from aerokit.protocols.named_values import (
     MIN_START_TIMEOUT_S,
     PAUSES,
     PROBE,
-    PROBE_INDEX,
     NamedReads,
     RepeatedAnswers,
     ValueList,
@@ -162,7 +161,7 @@ class SettingReads(NamedReads[Setting]):
         if not isinstance(message, ParamExtValue):
             return
         name = message.param_id
-        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
+        if self._is_probe_answer(message.param_index, now):
             self._count_probe_answer()
             self._window.on_answer(PROBE, now)
             # The component answers requests for index 0, so it may not know the names that it has not answered.

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
-from aerokit.protocols.exchange import Transfer, format_ranges
+from aerokit.protocols.exchange import StaleAnswerFilter, Transfer, format_ranges
 from aerokit.protocols.request_window import DEFAULT_SIZE, RequestWindow
 
 if TYPE_CHECKING:
@@ -154,6 +154,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._window: RequestWindow[str] = RequestWindow(self.round_trip, size=window, duplicate_last=duplicate_last)
         self._results: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
         self._sent_at: dict[str, float] = {}
+        self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -235,7 +236,16 @@ class NamedReads(NamedRequests[ValueT]):
         if self._is_probe_wanted and PROBE not in self._window:
             self._window.record_sent(PROBE, now)
             self._outbox += self._request(PROBE)
+            self._sent_at[PROBE] = now
         self._is_probe_wanted = False
+
+    def _is_probe_answer(self, index: int, now: float) -> bool:
+        attempts = self._window.attempts(PROBE)
+        if index != PROBE_INDEX or not attempts:
+            return False
+        # After a pause of the link, the answers to earlier probes arrive together. If each of them counted, all names
+        # without an answer would be rejected at once.
+        return not self._stale_answers.is_stale(PROBE, self._sent_at[PROBE], now, attempts=attempts)
 
     def _count_probe_answer(self) -> None:
         # There cannot be more answers than requests, so further answers are duplicates.

@@ -16,8 +16,7 @@ from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamValue
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
-from aerokit.protocols.exchange import StaleAnswerFilter
-from aerokit.protocols.named_values import BY_NAME, PROBE, PROBE_INDEX, NamedReads, NamedRequests, RepeatedAnswers
+from aerokit.protocols.named_values import BY_NAME, PROBE, NamedReads, NamedRequests, RepeatedAnswers
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -148,7 +147,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     def _on_value(self, message: ParamValue, now: float) -> None:
         # The probe requests index 0, which every vehicle has. An answer to another station also counts. This does no
         # harm, because a name is rejected only after several probes (see `_loss_probability`).
-        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0:
+        if self._is_probe_answer(message.param_index, now):
             self._on_probe_answer(now)
         name = message.param_id
         if name and name in self._window:
@@ -237,7 +236,6 @@ class ParameterWrites(ParameterRequests):
         self._must_read_again = set(self._recently_written)
         self._must_write = set(self._requested)  # names whose next request is a PARAM_SET
         self._repeated_answers: dict[str, RepeatedAnswers[Parameter]] = {}
-        self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
