@@ -139,19 +139,22 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout errors.
     """
 
+    window_size: ClassVar[int]  # initial limit of requests in flight
+
     def __init__(
         self,
         target_system: int,
         target_component: int,
         names: Iterable[str],
         *,
-        window: int,
         duplicate_last: bool = True,
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._names = tuple(dict.fromkeys(names))
-        self._window: RequestWindow[str] = RequestWindow(self.round_trip, size=window, duplicate_last=duplicate_last)
+        self._window: RequestWindow[str] = RequestWindow(
+            self.round_trip, size=self.window_size, duplicate_last=duplicate_last
+        )
         self._results: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
         self._sent_at: dict[str, float] = {}
         self._stale_answers = StaleAnswerFilter(self.round_trip)

@@ -53,14 +53,11 @@ class ParameterRequests(NamedRequests[Parameter]):
         names: Iterable[str],
         *,
         bytewise: bool,
-        window: int,
         duplicate_last: bool = True,
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(
-            target_system, target_component, names, window=window, duplicate_last=duplicate_last, **options
-        )
+        super().__init__(target_system, target_component, names, duplicate_last=duplicate_last, **options)
         self._bytewise, self._own_system = bytewise, own_system
 
     def _on_message(self, message: Message, now: float) -> None:
@@ -89,9 +86,6 @@ def rejection(name: str, code: int) -> ParameterRejected:
     return ParameterRejected(f"{name} was refused: {reason}", name=name, code=code)
 
 
-READ_WINDOW = 20
-
-
 class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """Read some parameters by name. The result has one answer for each name.
 
@@ -106,6 +100,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """
 
     unknown_text = "the vehicle has no parameter"
+    window_size = 20
 
     def __init__(
         self,
@@ -125,7 +120,6 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             target_component,
             names,
             bytewise=bytewise,
-            window=READ_WINDOW,
             duplicate_last=not probe,
             own_system=own_system,
             **options,
@@ -186,8 +180,6 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
 
 # Seconds after the first PARAM_SET in which old values may still arrive, as late answers to earlier requests.
 LATE_ANSWERS_S = 1.5
-# Maximum number of writes in flight. ArduPilot saves through a queue of 30, which must not overflow while armed.
-WRITE_WINDOW = 10
 
 
 class ParameterWrites(ParameterRequests):
@@ -209,6 +201,8 @@ class ParameterWrites(ParameterRequests):
             write, so the value is read once more.
     """
 
+    window_size = 10  # ArduPilot saves through a queue of 30, which must not overflow while armed.
+
     def __init__(
         self,
         target_system: int,
@@ -223,13 +217,7 @@ class ParameterWrites(ParameterRequests):
     ) -> None:
         self._requested = {parameter.name: parameter for parameter in requested}
         super().__init__(
-            target_system,
-            target_component,
-            self._requested,
-            bytewise=bytewise,
-            window=WRITE_WINDOW,
-            own_system=own_system,
-            **options,
+            target_system, target_component, self._requested, bytewise=bytewise, own_system=own_system, **options
         )
         self._before = dict(before)
         self._recently_written = frozenset(recent)
