@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
@@ -146,11 +145,7 @@ class SettingReads(NamedReads[Setting]):
     expects: tuple[type[Message], ...] = (ParamExtValue,)
     unknown_text = "the component has no setting"
     window_size = READ_WINDOW
-
-    def __init__(
-        self, target_system: int, target_component: int, names: Iterable[str], **options: Unpack[TransferOptions]
-    ) -> None:
-        super().__init__(target_system, target_component, names, duplicate_last=False, **options)
+    _may_probe = True
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamExtRequestRead(self.target_system, self.target_component, name, index)

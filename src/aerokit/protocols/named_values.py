@@ -140,20 +140,15 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     """
 
     window_size: ClassVar[int]  # initial limit of requests in flight
+    _may_probe = False  # True to detect unknown names by a probe. No request is then sent as two copies.
 
     def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        names: Iterable[str],
-        *,
-        duplicate_last: bool = True,
-        **options: Unpack[TransferOptions],
+        self, target_system: int, target_component: int, names: Iterable[str], **options: Unpack[TransferOptions]
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._names = tuple(dict.fromkeys(names))
         self._window: RequestWindow[str] = RequestWindow(
-            self.round_trip, size=self.window_size, duplicate_last=duplicate_last
+            self.round_trip, size=self.window_size, duplicate_last=not self._may_probe
         )
         self._results: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
         self._sent_at: dict[str, float] = {}

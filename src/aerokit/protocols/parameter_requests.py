@@ -53,11 +53,10 @@ class ParameterRequests(NamedRequests[Parameter]):
         names: Iterable[str],
         *,
         bytewise: bool,
-        duplicate_last: bool = True,
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(target_system, target_component, names, duplicate_last=duplicate_last, **options)
+        super().__init__(target_system, target_component, names, **options)
         self._bytewise, self._own_system = bytewise, own_system
 
     def _on_message(self, message: Message, now: float) -> None:
@@ -115,16 +114,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(
-            target_system,
-            target_component,
-            names,
-            bytewise=bytewise,
-            duplicate_last=not probe,
-            own_system=own_system,
-            **options,
-        )
         self._may_probe = probe
+        super().__init__(target_system, target_component, names, bytewise=bytewise, own_system=own_system, **options)
         self._is_probe_wanted = probe
         self._possibly_stale = dict(possibly_stale)
         self._refused_once: set[str] = set()
