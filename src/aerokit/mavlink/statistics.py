@@ -110,7 +110,7 @@ class SourceStatistics(SourceFields):
         if continues_other:
             if now - self._other_at < _EXPIRY_S:
                 return self._continue_other(sequence, now)
-            self._other_expected = -1  # The other stream has ended long ago.
+            self._other_expected = -1
         if ahead < _HALF:
             self._on_gap(ahead, now)
             return IN_ORDER
