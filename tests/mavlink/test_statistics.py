@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from aerokit.mavlink.statistics import IN_ORDER, LATE, OTHERS, SourceStatistics
+from aerokit.mavlink.statistics import IN_ORDER, LATE, OTHER_SENDER, SourceStatistics
 
 Frames = Iterable[tuple[float, int]]
 """Time and sequence number."""
@@ -43,13 +43,13 @@ def test_frame_of_other_sender_does_not_fill_gap(source: SourceStatistics) -> No
     verdicts_of(source, numbers(53, 110, 0.8))
     verdicts_of(source, numbers(111, 130, 1.4))
     assert source.lost == 1
-    assert verdicts_of(source, [(1.6, number) for number in (100, 103, 106, 109, 110)]) == [OTHERS] * 5
+    assert verdicts_of(source, [(1.6, number) for number in (100, 103, 106, 109, 110)]) == [OTHER_SENDER] * 5
     assert source.lost == 1
 
 
-@pytest.mark.parametrize(("after_s", "verdict"), [(1.5, OTHERS), (1.6, IN_ORDER)])
+@pytest.mark.parametrize(("after_s", "verdict"), [(1.5, OTHER_SENDER), (1.6, IN_ORDER)])
 def test_other_stream_takes_over_after_timeout(source: SourceStatistics, after_s: float, verdict: int) -> None:
-    assert verdicts_of(source, [(1.0, 100), (1.0 + after_s, 101)]) == [OTHERS, verdict]
+    assert verdicts_of(source, [(1.0, 100), (1.0 + after_s, 101)]) == [OTHER_SENDER, verdict]
 
 
 class _Sender:
@@ -114,7 +114,7 @@ def random_summary(seed: int) -> str:
     ],
 )
 def test_random_traffic_statistics_are_unchanged(seed: int, summary: str) -> None:
-    """Recorded counts (IN_ORDER, LATE, OTHERS, received, lost, duplicates) show any change of the rules."""
+    """Recorded counts (IN_ORDER, LATE, OTHER_SENDER, received, lost, duplicates) show any change of the rules."""
     assert random_summary(seed) == summary
 
 

@@ -145,7 +145,7 @@ def test_command_that_no_link_accepted_takes_no_ack(attempts: int) -> None:
     machine.message_dropped()
     machine.receive(ack(MavResult.ACCEPTED), 0.1)
     assert not machine.done
-    assert machine.pending_answers == 0
+    assert machine.pending_acks == 0
     for _ in range(attempts):
         assert machine.deadline is not None
         machine.expire(machine.deadline)

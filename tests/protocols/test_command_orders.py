@@ -184,7 +184,7 @@ def test_unrepeatable_order_ends_with_its_effect() -> None:
 
 
 def test_already_sent_order_is_not_sent_on_start() -> None:
-    machine = order(is_sent=True)
+    machine = order(sent_by_caller=True)
     assert machine.take_outbox() == []
     machine.expire(1.0)
     assert confirmations(machine) == [1]
@@ -201,19 +201,19 @@ def test_command_confirmation_is_capped() -> None:
 
 
 def test_answers_to_earlier_command_are_ignored() -> None:
-    machine = order(earlier_answers=1)
+    machine = order(earlier_acks=1)
     machine.receive(ack(IN_PROGRESS), 0.1)  # not a final answer
     assert machine.deadline == 1.0
     machine.receive(ack(DENIED), 0.2)
     assert not machine.done
-    assert machine.pending_answers == 1
+    assert machine.pending_acks == 1
     machine.receive(ack(ACCEPTED), 0.3)
     assert machine.result().result == ACCEPTED
 
 
 @pytest.mark.parametrize("attempts", [1, 2])
 def test_every_answer_counts_after_resend(attempts: int) -> None:
-    machine = order(earlier_answers=3, attempts=attempts)
+    machine = order(earlier_acks=3, attempts=attempts)
     for now in range(1, attempts):
         machine.expire(float(now))
     machine.receive(ack(DENIED), 2.1)
@@ -223,20 +223,20 @@ def test_every_answer_counts_after_resend(attempts: int) -> None:
 
 def test_pending_answers_count_sendings() -> None:
     machine = order(attempts=3)
-    assert machine.pending_answers == 1
+    assert machine.pending_acks == 1
     machine.expire(1.0)
-    assert machine.pending_answers == 2
+    assert machine.pending_acks == 2
     machine.receive(ack(IN_PROGRESS), 1.1)
-    assert machine.pending_answers == 2
+    assert machine.pending_acks == 2
     machine.receive(ack(ACCEPTED), 1.2)
-    assert machine.pending_answers == 1
+    assert machine.pending_acks == 1
 
 
 def test_pending_answers_exclude_earlier_ones() -> None:
-    machine = order(earlier_answers=2, acks_per_sending=2)
+    machine = order(earlier_acks=2, acks_per_sending=2)
     for answers, to_come in [(1, 2), (2, 2), (3, 1)]:
         machine.receive(ack(ACCEPTED), 0.1)
-        assert (machine.answers, machine.pending_answers) == (answers, to_come)
+        assert (machine.final_acks, machine.pending_acks) == (answers, to_come)
     assert machine.done
 
 

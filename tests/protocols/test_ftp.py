@@ -222,7 +222,7 @@ def test_ftp_retry_accepts_earlier_success(opcode: MavFtpOpcode, code: int) -> N
 
 
 def test_ftp_already_sent_request_is_not_sent() -> None:
-    request = FtpRequest(make_client(), Op.TERMINATESESSION, path="/a", is_sent=True)
+    request = FtpRequest(make_client(), Op.TERMINATESESSION, path="/a", sent_by_caller=True)
     request.start(0.0)
     assert request.take_outbox() == []
     assert request.deadline is not None

@@ -103,6 +103,15 @@ def test_unanswered_name_is_rejected_by_probe() -> None:
     assert channel.now < 1.5
 
 
+def test_answers_to_earlier_probes_reject_no_name() -> None:
+    """After a pause of the link, the answers to the probes of earlier reads arrive together."""
+    exchange = reads("PARAM_0004", probe=True, round_trip=RoundTrip(RTT_S, link_s=lambda: RTT_S))
+    exchange.start(0.0)
+    for _ in range(20):
+        exchange.receive(framed(m.ParamValue("PARAM_0000", 1.0, REAL32, 10, 0)), RTT_S)
+    assert not exchange.done
+
+
 def test_many_unknown_names_need_few_messages() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
     answers = channel.run(reads(*(f"NOPE_{i}" for i in range(100)), probe=True))

@@ -228,9 +228,9 @@ def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object
 
 
 @pytest.mark.parametrize(
-    ("method", "call"), [("run_shielded", "self._run(True, True,"), ("run_exit", "self._run(False, True,")]
+    ("method", "flags"), [("run_shielded", "is_shielded=True, must_start=True"), ("run_exit", "must_start=True")]
 )
-def test_clean_up_completes_wherever_ctrl_c_arrives(method: str, call: str) -> None:
+def test_clean_up_completes_wherever_ctrl_c_arrives(method: str, flags: str) -> None:
     """Interrupt at every line of aerokit except the calls themselves, where it cannot be noticed yet."""
     done: list[int] = []
 
@@ -262,7 +262,7 @@ def test_clean_up_completes_wherever_ctrl_c_arrives(method: str, call: str) -> N
                 left_undone.add(linecache.getline(*place).strip())
     assert len(was_come_to) > 20
     assert left_undone == {
-        f"return {call} function, *args, **kwargs)",
+        f"return self._run_call(function, args, kwargs, {flags})",
         "call: _Call[T] | None = None",
         "try:",
     }

@@ -232,7 +232,7 @@ async def test_bytes_cleared_from_driver_count_as_dropped_write(monkeypatch: pyt
         link = SerialLink(far.device, 57600)
         await link.open(Recorder())
         waiting = iter((taken, 0))
-        monkeypatch.setattr(link, "_waiting_to_be_sent", lambda transport: next(waiting))
+        monkeypatch.setattr(link, "_unsent_bytes_of", lambda transport: next(waiting))
         link.discard_unsent()
         assert link.dropped_writes == taken
         monkeypatch.undo()

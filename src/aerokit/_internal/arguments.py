@@ -34,7 +34,7 @@ Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
 # Maps an annotation to the check of its values, and to the description of valid values.
-_SIMPLE: dict[str, Rule] = {
+_SIMPLE_RULES: dict[str, Rule] = {
     "float": (lambda value: isinstance(value, Real), "a number"),
     "int": (lambda value: isinstance(value, Integral), "a whole number"),
     "bool": (lambda value: isinstance(value, bool), "True or False"),
@@ -59,7 +59,7 @@ def _is_above_zero(value: Any) -> bool:
         return False
 
 
-# Like `_SIMPLE`, but for parameters that denote a time.
+# Like `_SIMPLE_RULES`, but for parameters that denote a time.
 _SECONDS: dict[str, Rule] = {
     "float": (_is_above_zero, "a number of seconds above 0"),
     "float | None": (lambda value: value is None or _is_above_zero(value), "a number of seconds above 0, or None"),
@@ -179,7 +179,7 @@ def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
         return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
     # In our annotations, a constant is None or the `...` of tuple[X, ...]. The rule of `...` is not used.
     if isinstance(node, ast.Constant):
-        return _SIMPLE["None"]
+        return _SIMPLE_RULES["None"]
     if isinstance(node, ast.Subscript):
         return _generic_rule(_name_of(node.value), node.slice, module_globals)
     return _named_rule(_name_of(node), module_globals)
@@ -193,8 +193,8 @@ def _name_of(node: ast.expr) -> str:
 
 
 def _named_rule(name: str, module_globals: Mapping[str, Any]) -> Rule:
-    if name in _SIMPLE:
-        return _SIMPLE[name]
+    if name in _SIMPLE_RULES:
+        return _SIMPLE_RULES[name]
     annotated = module_globals.get(name)
     if isinstance(annotated, type):
         return (lambda value: isinstance(value, annotated)), with_article(name)
@@ -212,8 +212,8 @@ def _named_rule(name: str, module_globals: Mapping[str, Any]) -> Rule:
 
 def _generic_rule(name: str, inner: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
     """Return the rule of the annotation ``name[inner]``."""
-    if name in _SIMPLE:  # e.g. Callable[[int], None] or PathLike[str]
-        return _SIMPLE[name]
+    if name in _SIMPLE_RULES:  # e.g. Callable[[int], None] or PathLike[str]
+        return _SIMPLE_RULES[name]
     parts = inner.elts if isinstance(inner, ast.Tuple) else [inner]
     rules = [_rule(part, module_globals) for part in parts]
     if name == "type":

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from aerokit._internal.wire import wire
 from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame, x25
-from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
+from aerokit.mavlink.statistics import OTHER_SENDER, FramerStatistics, SourceLimit, SourceStatistics
 
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
@@ -39,10 +39,10 @@ _MAGICS = (MAGIC_V1, MAGIC_V2)
 _find_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 
 # Verdicts about a position in the data.
-_GOOD = 0  # a whole frame with a valid checksum
-_WAIT = 1  # the beginning of a plausible frame
-_IMPLAUSIBLE = 2  # the beginning of an unlikely frame: wait for its rest, but also look for frames that begin inside it
-_UNKNOWN = 3  # looks like a whole frame of an unknown message
+_VALID = 0  # a whole frame with a valid checksum
+_INCOMPLETE = 1  # the beginning of a plausible frame: wait for its rest
+_UNLIKELY = 2  # the beginning of an unlikely frame: wait for its rest, but also look for frames that begin inside it
+_UNKNOWN_MESSAGE = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
 
@@ -61,7 +61,7 @@ class _OutOfOrder(NamedTuple):
     """A frame whose sequence number was not the expected one."""
 
     position: int  # in the list of returned frames, if the message is wanted
-    ordering: int  # LATE or OTHERS
+    ordering: int  # LATE or OTHER_SENDER
     identity: int  # sequence number << 16 | component id << 8 | system id
 
 
@@ -185,7 +185,7 @@ class PythonFramer:
             try:
                 source = sources[key]
             except KeyError:
-                source = self.statistics.add_source(key, sequence, self._limit.make_room(now))
+                source = self.statistics.add_source(key, sequence, has_room=self._limit.make_room(now))
             if source.expected & 0xFF == sequence:
                 source.expected += 1
             else:
@@ -236,7 +236,7 @@ class PythonFramer:
                 # `frames` has only the wanted messages, so the frame at `position` may be a different one.
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
                     continue
-                if ordering == OTHERS:
+                if ordering == OTHER_SENDER:
                     self.foreign.append(frame)
                 else:
                     self.late.append(frame)
@@ -244,9 +244,12 @@ class PythonFramer:
     # -------------------------------------------------------------------------------- slow path
 
     def _search(self, data: bytes, begin: int, scan: _ScanState) -> _ValidFrame | None:
-        """Return the next valid frame from ``begin`` on, or None. Store data of an incomplete frame in ``_rest``."""
+        """Return the next valid frame from ``begin`` on, or None. Store data of an incomplete frame in ``_rest``.
+
+        ``scan`` has the candidates (positions at which a frame may begin) that the previous call left undecided.
+        """
         size = len(data)
-        keep_from = -1  # position from which data is kept
+        keep_from = -1  # position from which data is kept; -1 if nothing is kept
         unknown_begin = unknown_end = -1  # a possible frame of an unknown message; -1 if there is none
         examined_to = scan.examined_to
         pending: list[_Candidate] = []
@@ -254,7 +257,7 @@ class PythonFramer:
         # The end 0 makes the loop examine these candidates, and replace the verdict `_NOISE`.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
-        end_of_data = (size, _NOISE, size)
+        end_of_data = (size, _NOISE, size)  # decides about an unknown frame at the end of the data
         for position, verdict, end in chain(scan.candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
                 # The unknown frame contains no valid frame. It is accepted if a frame or the end of the data follows.
@@ -268,23 +271,23 @@ class PythonFramer:
                 unknown_begin = -1
             if position >= size:
                 break
-            # Examine the candidate if enough data has arrived. A verdict of `_UNKNOWN` is final.
-            if end <= size and verdict != _UNKNOWN:
+            # Examine the candidate if enough data has arrived. A verdict of `_UNKNOWN_MESSAGE` is final.
+            if end <= size and verdict != _UNKNOWN_MESSAGE:
                 verdict, end, frame = self._examine(data, position)
-                if verdict == _GOOD:
+                if verdict == _VALID:
                     self._count_skipped(begin, position, bad_crcs)
                     return frame
             if verdict == _BAD_CRC:
                 bad_crcs.append(position)
             elif verdict != _NOISE:
                 pending.append((position, verdict, end))
-            if verdict == _WAIT:
+            if verdict == _INCOMPLETE:
                 keep_from = _earliest(keep_from, unknown_begin, position)
                 examined_to = position + 1
                 break  # The following bytes probably belong to this frame, so they are examined later.
-            if verdict == _IMPLAUSIBLE and keep_from < 0:
-                keep_from = position
-            elif verdict == _UNKNOWN and keep_from < 0 and unknown_begin < 0:
+            if verdict == _UNLIKELY and keep_from < 0:
+                keep_from = position  # Later candidates, which may be inside this frame, are still examined.
+            elif verdict == _UNKNOWN_MESSAGE and keep_from < 0 and unknown_begin < 0:
                 unknown_begin, unknown_end = position, end
         keep = size if keep_from < 0 else keep_from
         self._count_skipped(begin, keep, bad_crcs)
@@ -327,10 +330,10 @@ class PythonFramer:
         size = len(data)
         if data[begin] == MAGIC_V2:
             if size - begin < 3:  # The flags have not arrived yet.
-                return _WAIT, begin + 3, None
+                return _INCOMPLETE, begin + 3, None
             if size - begin < _MIN_LENGTH_V2:
                 has_valid_flags = data[begin + 2] <= SIGNED
-                return (_WAIT if has_valid_flags else _NOISE), begin + _MIN_LENGTH_V2, None
+                return (_INCOMPLETE if has_valid_flags else _NOISE), begin + _MIN_LENGTH_V2, None
             _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None
@@ -339,24 +342,24 @@ class PythonFramer:
             end = payload + length + 2 + (SIGNATURE_LENGTH if flags else 0)
         else:
             if size - begin < _MIN_LENGTH_V1:
-                return _WAIT, begin + _MIN_LENGTH_V1, None
+                return _INCOMPLETE, begin + _MIN_LENGTH_V1, None
             length, sequence, key, message_id = _HEADER_V1(data, begin)
             payload = begin + 6
             end = payload + length + 2
         row = self._rows.get(message_id)
         if row is None:
-            return (_UNKNOWN if end <= size else _IMPLAUSIBLE), end, None
+            return (_UNKNOWN_MESSAGE if end <= size else _UNLIKELY), end, None
         extra, base_length, full_length = row
         is_v1 = data[begin] == MAGIC_V1
         if is_v1 and not base_length <= length <= full_length:
             return _NOISE, size, None  # A MAVLink 1 payload is neither truncated nor longer than its definition.
         if end > size:
-            return (_WAIT if length <= full_length else _IMPLAUSIBLE), end, None
+            return (_INCOMPLETE if length <= full_length else _UNLIKELY), end, None
         payload_end = payload + length
         (checksum,) = _CHECKSUM(data, payload_end)
         if x25(data[begin + 1 : payload_end] + bytes((extra,))) != checksum:
             return _BAD_CRC, end, None
-        return _GOOD, end, _ValidFrame(begin, end, message_id, sequence, source=key)
+        return _VALID, end, _ValidFrame(begin, end, message_id, sequence, source=key)
 
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
@@ -386,14 +389,14 @@ else:
             if kept == 2:
                 scan = self._scan
             elif kept == 1:
-                scan = _ScanState(examined_to=1, candidates=[(0, _WAIT, 0)])
+                scan = _ScanState(examined_to=1, candidates=[(0, _INCOMPLETE, 0)])
             next_frame = self._search(data, begin, scan)
             if self._unknown:
                 frames += self._take_unknown(now)
             return None if next_frame is None else next_frame.begin
 
         def _add_source(self, key: int, sequence: int, now: float) -> SourceStatistics:
-            return self.statistics.add_source(key, sequence, self._limit.make_room(now))
+            return self.statistics.add_source(key, sequence, has_room=self._limit.make_room(now))
 
         def _count_out_of_order(self, source: SourceStatistics, key: int, sequence: int, now: float, at: int) -> None:
             if ordering := source.out_of_order(sequence, now):

@@ -52,6 +52,7 @@ def read_additions() -> list[DialectDefinition]:
 def with_added_messages(
     messages: Sequence[MessageDefinition], additions: Sequence[DialectDefinition]
 ) -> list[MessageDefinition]:
+    """Return the messages with those of ``additions``. A message in both gets the added fields and remarks."""
     merged = {message.id: message for message in messages}
     for added in (message for dialect in additions for message in dialect.messages):
         existing = merged.get(added.id)
@@ -62,6 +63,7 @@ def with_added_messages(
 
 
 def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]) -> list[EnumDefinition]:
+    """Return the enums with those of ``additions``. An enum in both gets the added entries and remarks."""
     merged = {enum.name: enum for enum in enums}
     for added in (enum for dialect in additions for enum in dialect.enums):
         existing = merged.get(added.name)

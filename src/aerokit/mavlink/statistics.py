@@ -19,7 +19,7 @@ _STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no aut
 _MIN_RETURNS = 3  # If the other stream is longer, it becomes the current one after this many further frames.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
-IN_ORDER, LATE, OTHERS = range(3)
+IN_ORDER, LATE, OTHER_SENDER = range(3)
 
 
 class SourceStatistics(SourceFields):
@@ -36,7 +36,6 @@ class SourceStatistics(SourceFields):
         "_alternated_at",
         "_alternations",
         "_last_expected",
-        "_late_run",
         "_missing",
         "_missing_base",
         "_other_at",
@@ -44,6 +43,7 @@ class SourceStatistics(SourceFields):
         "_other_expected",
         "_received_at_repetition",
         "_repeated_sequence",
+        "_repetitions",
         "_returns",
         "_skipped_over",
         "_stream_start",
@@ -53,7 +53,7 @@ class SourceStatistics(SourceFields):
         "system_id",
     )
 
-    _late_run: int  # length of the current run of repeated frames with consecutive sequence numbers
+    _repetitions: int  # number of repeated frames with consecutive sequence numbers, up to the last one
     # If two senders use the same ids, their sequence numbers form two streams. `expected` belongs to the current one,
     # these attributes to the other one. They are set when a second stream begins.
     _other_count: int  # number of frames of the other stream
@@ -101,13 +101,14 @@ class SourceStatistics(SourceFields):
         """Process a frame whose sequence number is not `expected`, and return how it is to be treated.
 
         `IN_ORDER`: it is the newest frame, after lost frames or a reboot of the sender. `LATE`: a newer frame has
-        overtaken it, or it is a repetition. `OTHERS`: a second sender with the same ids has sent it.
+        overtaken it, or it is a repetition. `OTHER_SENDER`: a second sender with the same ids has sent it.
         """
         if self.expected != self._last_expected:
             self._last_expected, self._advanced_at = self.expected, now
         ahead = (sequence - self.expected) & 0xFF
-        if self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP:
-            if now - self._other_at < _EXPIRY_S:  # The frame continues the other stream.
+        continues_other = self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP
+        if continues_other:
+            if now - self._other_at < _EXPIRY_S:
                 return self._continue_other(sequence, now)
             self._other_expected = -1
         if ahead < _HALF:
@@ -132,7 +133,7 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._skipped_over = ahead
         missing_bits = ((1 << ahead) - 1) << 1  # bit 0 is this frame
-        self._missing = self._shifted(ahead + 1) | missing_bits & _WINDOW
+        self._missing = self._missing_shifted(ahead + 1) | missing_bits & _WINDOW
         self.skip(ahead)
         self.expected += 1
         self._missing_base = self.expected
@@ -145,14 +146,14 @@ class SourceStatistics(SourceFields):
         self._stream_start = self.received
         self._returns = self._skipped_over = 0
 
-    def _shifted(self, advance: int) -> int:
+    def _missing_shifted(self, advance: int) -> int:
         """Return the bits of `_missing` for a `_missing_base` of `expected` + ``advance``."""
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _consume_missing(self, behind: int) -> bool:
         """Mark the frame ``behind`` places before `expected` as received. Return True if it was missing."""
-        self._missing, self._missing_base = self._shifted(0), self.expected
+        self._missing, self._missing_base = self._missing_shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
         self._missing &= ~bit
@@ -161,19 +162,18 @@ class SourceStatistics(SourceFields):
     def _on_repeated(self, sequence: int, now: float) -> int:
         """Process an old frame that was not missing. Return a result of :meth:`out_of_order`."""
         # A single old frame is a repetition. Several with consecutive numbers show that the sender rebooted.
-        follows = sequence == (self._repeated_sequence + 1) & 0xFF
-        is_direct_succession = follows and self._received_at_repetition == self.received
-        self._late_run = self._late_run + 1 if is_direct_succession else 0
+        follows_last_repetition = sequence == (self._repeated_sequence + 1) & 0xFF
+        is_next_frame = follows_last_repetition and self._received_at_repetition == self.received
+        self._repetitions = self._repetitions + 1 if is_next_frame else 1
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
         # Links may repeat two or three recent frames, so only four in a row show a reboot. Links hardly ever repeat
         # older frames, so two are enough.
-        min_run = 3 if is_near else 1
-        if self._late_run >= min_run:
+        if self._repetitions >= (4 if is_near else 2):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
         # Repeated frames in sequence may come from a second sender, whose frames alternate with those of the first.
-        if follows:
+        if follows_last_repetition:
             self._count_alternation(now)
         else:
             self._alternations = 0
@@ -181,7 +181,7 @@ class SourceStatistics(SourceFields):
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._repeated_sequence = sequence
         self._received_at_repetition = self.received
-        return OTHERS if self.has_duplicates(now) else LATE
+        return OTHER_SENDER if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
         """Make this sequence number the newest."""
@@ -204,7 +204,7 @@ class SourceStatistics(SourceFields):
         if is_over or self._returns >= _MIN_RETURNS:
             # If the other stream is shorter, its frames are counted from 0 again.
             other_count = self._other_count if is_other_longer else 0
-            self._swap(sequence, now, current_count, other_count)
+            self._swap_streams(sequence, now, current_count=current_count, other_count=other_count)
             return IN_ORDER
         if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
             # The frame is in the gap between the streams, and was counted as lost.
@@ -216,9 +216,10 @@ class SourceStatistics(SourceFields):
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # The frame does not count as one of the current stream.
         # The shorter stream is assumed to come from a second sender.
-        return LATE if is_other_longer else OTHERS
+        return LATE if is_other_longer else OTHER_SENDER
 
-    def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
+    def _swap_streams(self, sequence: int, now: float, *, current_count: int, other_count: int) -> None:
+        """Make the other stream the current one. It continues with the frame that has this sequence number."""
         # The numbers between the two streams were not lost, so they are subtracted. Some of them may have arrived late
         # and been subtracted before, so the difference may be negative.
         self.lost = max(0, self.lost - self._skipped_over)

@@ -148,11 +148,11 @@ class ComponentCommands:
         A command for which ``is_stop`` returns True cancels a running handler. Raises InvalidArgument if the command
         already has a handler, or an annotation of the function is not supported.
         """
+        arguments = arguments_of(function)
 
         def execute(received: ReceivedCommand) -> None:
             self._execute(function, arguments, received, is_stop=is_stop(received))
 
-        arguments = arguments_of(function)
         self._register({command: execute})
 
     def _register(self, handlers: Mapping[int, CommandHandler]) -> None:
@@ -185,10 +185,10 @@ class ComponentCommands:
 
         A plain function runs in a thread if `uses_threads` is True.
         """
-        result = self.begin(function, *arguments)
+        result = self.start_call(function, *arguments)
         return await result if inspect.isawaitable(result) else result
 
-    def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
+    def start_call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Like `call`, but return the result or an awaitable for it."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             try:
@@ -260,7 +260,7 @@ class _Execution:
         request = CommandRequest(running.command, self._report)
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
-            self._returned = self._commands.begin(self._function, request, *values)
+            self._returned = self._commands.start_call(self._function, request, *values)
             result = None if inspect.isawaitable(self._returned) else command_result(self._returned)
         except Exception as error:
             self._finish_with_error(error)

@@ -124,7 +124,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         if not method or not overrides(winch, WinchDriver, method):
             raise NotSupported(f"this winch does not support action {action}")
         arguments = _winch_arguments(method, length, rate)
-        if method == "set_rate":
+        if method == "set_rate":  # The line then moves until it is stopped, at the latest when the component ends.
             can_hold = overrides(winch, WinchDriver, "hold")
             services.stop_functions["winch"] = winch.hold if can_hold else partial(winch.set_rate, 0.0)
         await services.commands.call(getattr(winch, method), *arguments)

@@ -77,7 +77,7 @@ class ComponentHost:
         def on_message(message: Message) -> None:
             sender = sender_of(message)
             if not self._is_closed and self._is_addressed(message, sender) and not self._is_late(message):
-                self._guarded(lambda: handler(message, sender))
+                self._run_and_log_errors(lambda: handler(message, sender))
 
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
 
@@ -141,7 +141,7 @@ class ComponentHost:
     def call_at(self, when: float, action: Callable[[], None]) -> None:
         def alarm() -> None:
             if not self._is_closed:
-                self._guarded(action)
+                self._run_and_log_errors(action)
 
         self.connection.deadlines.set(alarm, when)
 
@@ -157,7 +157,7 @@ class ComponentHost:
         self._is_closed = True
         self.stop_receiving()
 
-    def _guarded(self, action: Callable[[], Any]) -> None:
+    def _run_and_log_errors(self, action: Callable[[], Any]) -> None:
         try:
             action()
         except AerokitError as error:

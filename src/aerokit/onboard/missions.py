@@ -109,7 +109,7 @@ class ComponentMissions:
         try:
             check_items(items, mission_type)
             if function is not None:
-                verdict = self._commands.begin(function, kind, items)
+                verdict = self._commands.start_call(function, kind, items)
             result_now = None if inspect.isawaitable(verdict) else _result_of(verdict)
         except Exception as error:
             answer(self._report_refusal(kind, error))

@@ -106,19 +106,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             InvalidArgument: the name is invalid or in use, the default or ``on_set`` is not allowed, or the component
                 already has 1000 parameters.
         """
-        if inspect.iscoroutinefunction(on_set):
-            raise InvalidArgument("on_set must be a plain function, because the value is answered at once")
-        check_name(name)
-        if self._has_camera_settings:
-            raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
-        if name in self._rows:
-            raise InvalidArgument(f"this component already has a parameter {name}")
-        if len(self._rows) >= MAX_COMPONENT_PARAMETERS:
-            raise InvalidArgument(f"a component has at most {MAX_COMPONENT_PARAMETERS} parameters")
-        if isinstance(default, bool) or type(default) not in _TYPES:
-            raise InvalidArgument(
-                f"default = {default!r} of {name} is not allowed: it must be an int, a float or a str"
-            )
+        self._check_addition(name, default, on_set)
         metadata = ParameterMetadata(
             name,
             short_description=description,
@@ -153,6 +141,21 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         if self._rows:
             raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         self._has_camera_settings = True
+
+    def _check_addition(self, name: str, default: object, on_set: Callable[..., object] | None) -> None:
+        if inspect.iscoroutinefunction(on_set):
+            raise InvalidArgument("on_set must be a plain function, because the value is answered at once")
+        check_name(name)
+        if self._has_camera_settings:
+            raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
+        if name in self._rows:
+            raise InvalidArgument(f"this component already has a parameter {name}")
+        if len(self._rows) >= MAX_COMPONENT_PARAMETERS:
+            raise InvalidArgument(f"a component has at most {MAX_COMPONENT_PARAMETERS} parameters")
+        if isinstance(default, bool) or type(default) not in _TYPES:
+            raise InvalidArgument(
+                f"default = {default!r} of {name} is not allowed: it must be an int, a float or a str"
+            )
 
     def set(self, name: str, value: int | float | str) -> None:
         """Change a value, and announce it to other programs. ``on_set`` is not called.

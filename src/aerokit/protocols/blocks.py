@@ -44,7 +44,7 @@ class CongestionWindow:
         self._size = float(start)
         self._min_size, self._max_size = min_size, max_size
         self._fastest_s: float | None = None
-        self._loss = 0.0  # average fraction of lost requests
+        self._average_loss = 0.0  # average fraction of lost requests
 
     @property
     def size(self) -> int:
@@ -54,23 +54,24 @@ class CongestionWindow:
         """Raise the window to ``size`` requests, up to half of ``max_size``."""
         self._size = max(self._size, min(size, self._max_size / 2))
 
-    def on_answer(self, seconds: float | None) -> None:
-        """Record an answer. ``seconds`` is the time since its request, or None if it must not be measured."""
-        self._loss -= LOSS_WEIGHT * self._loss  # The average moves towards 0 with an answer, towards 1 with a loss.
-        if seconds is None:
+    def on_answer(self, round_trip_s: float | None) -> None:
+        """Record an answer. ``round_trip_s`` is the time since its request, or None if it must not be measured."""
+        # This moves the average towards 0, as each loss moves it towards 1.
+        self._average_loss -= LOSS_WEIGHT * self._average_loss
+        if round_trip_s is None:
             return
-        if self._fastest_s is None or seconds < self._fastest_s:
-            self._fastest_s = seconds
-        if seconds <= FAST_FACTOR * self._fastest_s + FAST_MARGIN_S:
+        if self._fastest_s is None or round_trip_s < self._fastest_s:
+            self._fastest_s = round_trip_s
+        if round_trip_s <= FAST_FACTOR * self._fastest_s + FAST_MARGIN_S:
             self._size = min(self._max_size, self._size + WIDENING)
-        elif seconds > QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
+        elif round_trip_s > QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:  # A queue builds up.
             self._size = max(self._min_size, self._size - NARROWING)
 
     def on_loss(self) -> None:
-        self._loss += LOSS_WEIGHT * (1.0 - self._loss)
-        if self._loss > MAX_LOSS:
+        self._average_loss += LOSS_WEIGHT * (1.0 - self._average_loss)
+        if self._average_loss > MAX_LOSS:
             self._size = max(self._min_size, self._size / 2)
-            self._loss = 0.5  # Below the limit, so that only further losses halve the size again.
+            self._average_loss = 0.5  # Below the limit, so that only further losses halve the size again.
 
 
 class _BlockRequest:
@@ -147,12 +148,12 @@ class BlockRequests:
         # No time is measured if the answered transmission is unknown (None), or was sent while the server was busy with
         # a burst.
         if sent_at is None or sent_at <= self._busy_until:
-            self.window.on_answer(None)
+            self.window.on_answer(round_trip_s=None)
             return
         self._round_trip.add_sample(now - sent_at)
         self.window.on_answer(now - sent_at)
         if block.attempts == 1:
-            self._requeue_lost(block.transmission_number)
+            self._requeue_lost(answered_transmission=block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
         """Return when the answered transmission was sent, or None if it is unknown which one was answered."""
@@ -175,7 +176,8 @@ class BlockRequests:
         due: list[int] = []
         self._must_wait_to_send = False
         while self._waiting and len(self._in_flight) < size:
-            if len(self._in_flight) >= self._batch_size:
+            is_batch_sent = len(self._in_flight) >= self._batch_size
+            if is_batch_sent:  # Further requests are sent one by one, with pauses.
                 if now < self._next_send_at:
                     self._must_wait_to_send = True
                     break
@@ -199,10 +201,11 @@ class BlockRequests:
         block.sent_at = now
         self._in_flight[offset] = block
 
-    def _requeue_lost(self, answered_number: int) -> None:
+    def _requeue_lost(self, *, answered_transmission: int) -> None:
+        # Answers arrive in the order of the requests, so requests that were sent well before the answered one are lost.
         lost = []
         for offset, block in self._in_flight.items():
-            if block.transmission_number > answered_number - LOSS_THRESHOLD:
+            if block.transmission_number > answered_transmission - LOSS_THRESHOLD:
                 break  # All further blocks were requested later.
             lost.append(offset)
         self._requeue(lost)

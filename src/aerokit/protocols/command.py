@@ -192,12 +192,12 @@ class CommandExchange(Exchange[CommandAck]):
         attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for a command in `UNREPEATABLE_COMMANDS`.
         progress_timeout: seconds from an IN_PROGRESS until the command fails, unless another answer arrives.
         on_progress: called at each IN_PROGRESS with 0–100, or None if the vehicle does not report a percentage.
-        earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with
+        earlier_acks: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with
             the same MAV_CMD. Once this command was repeated, every acknowledgement counts.
         acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: determines whether the command may be repeated; None if nothing prevents it.
-        is_sent: True if the caller itself makes the first transmission. The exchange then only repeats the command.
+        sent_by_caller: True if the caller makes the first transmission. The exchange only repeats the command.
 
     Raises from ``result()``:
         CommandRejected: the result is neither ACCEPTED nor IN_PROGRESS. The caller adds status texts of the vehicle.
@@ -221,20 +221,20 @@ class CommandExchange(Exchange[CommandAck]):
         attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        earlier_answers: int = 0,
+        earlier_acks: int = 0,
         acks_per_sending: int = 1,
         min_timeout_s: float = 0.0,
         order_status: OrderStatus | None = None,
-        is_sent: bool = False,
+        sent_by_caller: bool = False,
     ) -> None:
         super().__init__()
-        is_unrepeatable = False
+        default_timeout_s = ATTEMPT_TIMEOUT_S
         if attempts is None:
             attempts = allowed_attempts(message.command, _params_of(message))
-            is_unrepeatable = attempts == 1
+            if attempts == 1:  # A command that must not be repeated waits as long as all attempts of another command.
+                default_timeout_s *= MAX_ATTEMPTS
         if attempt_timeout is None:
-            # A command that must not be repeated waits as long as all attempts of another command.
-            attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
+            attempt_timeout = default_timeout_s
         if attempt_timeout > 0:  # Other values are refused below, and the error must show them unchanged.
             attempt_timeout = max(attempt_timeout, min_timeout_s)
         if attempts < 1:
@@ -246,31 +246,31 @@ class CommandExchange(Exchange[CommandAck]):
         self._own_ids = (own_system, own_component)
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
         self._progress_timeout, self._on_progress = progress_timeout, on_progress
-        self._earlier_answers, self._acks_per_sending = earlier_answers, acks_per_sending
+        self._earlier_acks, self._acks_per_sending = earlier_acks, acks_per_sending
         self._order_status = order_status
-        self._is_sent = is_sent
+        self._sent_by_caller = sent_by_caller
         self._sent_count = 0  # number of transmissions, including a first one by the caller
         self._dropped_count = 0  # number of these transmissions that no link accepted
-        self.answers: int = 0
-        """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
+        self.final_acks: int = 0
+        """Number of acknowledgements received except IN_PROGRESS, including those to earlier, equal commands."""
         self._in_progress = False
 
     def start(self, now: float) -> None:
         self._started_at = now
         self._send(now)
-        if self._is_sent:  # The caller itself sends the first message.
+        if self._sent_by_caller:
             self._outbox.clear()
 
     def receive(self, message: Message, now: float) -> None:
         """Process a COMMAND_ACK. Other messages are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
-        # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
+        # The first `_earlier_acks` acknowledgements may belong to earlier commands, so they are ignored until the
         # command is repeated. A command with a single attempt ignores none, because it may get only one.
         may_ignore = self._transmitted_count == 1 and self._attempts > 1
-        is_to_earlier_command = not self._transmitted_count or (may_ignore and self.answers < self._earlier_answers)
+        is_to_earlier_command = self._transmitted_count == 0 or (may_ignore and self.final_acks < self._earlier_acks)
         if message.result != MavResult.IN_PROGRESS:
-            self.answers += 1
+            self.final_acks += 1
         if is_to_earlier_command:
             return
         if message.result == MavResult.IN_PROGRESS:
@@ -281,12 +281,12 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(rejection(message.command, message.result))
 
     @property
-    def pending_answers(self) -> int:
+    def pending_acks(self) -> int:
         """Number of acknowledgements that may still arrive. The next command with this MAV_CMD must ignore them."""
         # Once the command was repeated, every acknowledgement counts as an answer to this command; see `receive`.
-        ignored_answers = self._earlier_answers if self._transmitted_count <= 1 else 0
-        own_answers = max(0, self.answers - ignored_answers)
-        return max(0, self._transmitted_count * self._acks_per_sending - own_answers)
+        ignored_acks = self._earlier_acks if self._transmitted_count <= 1 else 0
+        own_acks = max(0, self.final_acks - ignored_acks)
+        return max(0, self._transmitted_count * self._acks_per_sending - own_acks)
 
     def message_dropped(self) -> None:
         self._dropped_count += 1
@@ -298,14 +298,14 @@ class CommandExchange(Exchange[CommandAck]):
         if self._in_progress:
             self._time_out(now)
         elif self._order_status is not None:
-            self._expire_order(self._order_status, now)
+            self._repeat_order_or_fail(self._order_status, now)
         elif self._sent_count < self._attempts:
             self._send(now)
         else:
             self._time_out(now)
 
-    def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        if order_status.end:
+    def _repeat_order_or_fail(self, order_status: OrderStatus, now: float) -> None:
+        if order_status.end:  # The order has ended; the text says why.
             self._time_out(now, f"; not sent again: {order_status.end}")
             return
         # The time is checked first: if the event loop was blocked, a recent HEARTBEAT must not cause a late repetition.
@@ -334,7 +334,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_at = now
         wait_s = self._attempt_timeout
         if self._order_status is not None:
-            # From this deadline on, `_expire_order` checks whether the command may be repeated.
+            # From this deadline on, `_repeat_order_or_fail` checks whether the command may be repeated.
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 

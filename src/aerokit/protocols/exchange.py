@@ -350,7 +350,7 @@ class StaleAnswerFilter:
         self._round_trip = round_trip
         self._early_requests: dict[str, set[float]] = {}  # by name: send times of requests answered too early
 
-    def refuses(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
+    def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
         """Return True if ``now`` is too early for an answer to the request for ``name`` sent at ``sent_at``.
 
         ``attempts`` is the number of transmissions of the request. For each name, True is returned for at most

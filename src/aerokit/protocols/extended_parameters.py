@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
@@ -15,7 +14,6 @@ from aerokit.protocols.named_values import (
     MIN_START_TIMEOUT_S,
     PAUSES,
     PROBE,
-    PROBE_INDEX,
     NamedReads,
     RepeatedAnswers,
     ValueList,
@@ -105,7 +103,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._last_at = now
             timeout_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
             self._stream_deadline = now + min(timeout_s, MAX_STREAM_TIMEOUT_S)
-            self._window.discard(index)
+            self._window.discard(index)  # A streamed value does not measure the round trip.
         else:
             self._window.on_answer(index, now)
         self._store(index, setting, count, now)
@@ -146,26 +144,23 @@ class SettingReads(NamedReads[Setting]):
 
     expects: tuple[type[Message], ...] = (ParamExtValue,)
     unknown_text = "the component has no setting"
-
-    def __init__(
-        self, target_system: int, target_component: int, names: Iterable[str], **options: Unpack[TransferOptions]
-    ) -> None:
-        super().__init__(target_system, target_component, names, window=READ_WINDOW, duplicate_last=False, **options)
+    window_size = READ_WINDOW
+    _may_probe = True
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamExtRequestRead(self.target_system, self.target_component, name, index)
 
-    def _check_overdue(self, now: float) -> None:
+    def _process_overdue(self, now: float) -> None:
         self._is_probe_wanted = bool(self._overdue(now))
 
     def _on_message(self, message: Message, now: float) -> None:
         if not isinstance(message, ParamExtValue):
             return
         name = message.param_id
-        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
-            self._count_probe()
+        if self._is_probe_answer(message.param_index, now):
+            self._count_probe_answer()
             self._window.on_answer(PROBE, now)
-            # The answered probe shows that the component answers, so it may not know the names without an answer.
+            # The component answers requests for index 0, so it may not know the names that it has not answered.
             unanswered = [other for other in self._names if other not in self._results and other != name]
             self._reject_if_requested_often(unanswered, now)
         if name and name in self._window:
@@ -261,7 +256,7 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
-        """Write or read again, unless enough equal answers have arrived."""
+        """Write or read again. Enough equal answers end the write instead."""
         self._repeated_answers.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
         if not self._repeated_answers.are_conclusive(is_unchanged=is_unchanged):
@@ -299,7 +294,7 @@ class SettingWrite(Transfer[Setting]):
             self.round_trip.add_sample(now - self._sent_at)
 
     def _is_stale(self, now: float) -> bool:
-        return self._stale_answers.refuses(self._name, self._sent_at, now, attempts=self._attempts)
+        return self._stale_answers.is_stale(self._name, self._sent_at, now, attempts=self._attempts)
 
 
 def _is_same(first: Setting, second: Setting) -> bool:

@@ -304,7 +304,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     Args:
         path: used in error texts.
-        is_sent: True if the caller itself makes the first transmission. The exchange then only repeats the request.
+        sent_by_caller: True if the caller makes the first transmission. The exchange only repeats the request.
     """
 
     attempts: int
@@ -321,16 +321,16 @@ class FtpRequest(FtpExchange[FtpMessage]):
         session: int = 0,
         offset: int = 0,
         data: bytes = b"",
-        is_sent: bool = False,
+        sent_by_caller: bool = False,
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(client, path, **options)
         self.attempts = 0
-        """Number of times the request was sent, including the one by the caller (``is_sent``), which `start` counts."""
+        """Number of times the request was sent, including the first one by the caller, which `start` counts."""
         self._request = FtpMessage(
             client.next_sequence(), opcode, session=session, size=len(data), offset=offset, data=data
         )
-        self._is_sent = is_sent
+        self._sent_by_caller = sent_by_caller
         self._renumbered = 0  # number of times the request got a new sequence number
 
     @property
@@ -351,10 +351,10 @@ class FtpRequest(FtpExchange[FtpMessage]):
         return self._result is not None
 
     def start(self, now: float) -> None:
-        """Start the exchange: send the request, unless the caller sends it (``is_sent``)."""
+        """Start the exchange: send the request, unless the caller sends it (``sent_by_caller``)."""
         self._start_clock(now)
         self._transmit(now)
-        if self._is_sent:  # The caller itself sends the first message.
+        if self._sent_by_caller:
             self._outbox.clear()
 
     def expire(self, now: float) -> None:
@@ -377,17 +377,17 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.sequence != (self._request.sequence + 1) % SEQUENCE_COUNT:
-            self._receive_other(reply, now)
+            self._on_reply_to_other_request(reply, now)
         elif reply.request_opcode != self._request.opcode:  # The server has repeated its reply to an earlier request.
             self._renumber(now)
         else:
             if self.attempts == 1 and self._request.opcode not in SLOW_REQUESTS:
                 self.round_trip.add_sample(now - self._sent_at)
-            self._end(reply)
+            self._finish_or_fail(reply)
 
     def _renumber(self, now: float) -> None:
-        # An earlier request had the same sequence number, so the server took this request for a repetition of the
-        # earlier one. With a new number, the server executes this request.
+        """Send the request with a new sequence number, so that the server executes it."""
+        # An earlier request had the same number, so the server took this request for a repetition of the earlier one.
         if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())
@@ -395,13 +395,13 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._outbox.append(self.message)
             self._wait(now)
 
-    def _receive_other(self, reply: FtpMessage, now: float) -> None:
+    def _on_reply_to_other_request(self, reply: FtpMessage, now: float) -> None:
         # ArduPilot answers TERMINATESESSION only after the current burst, so the blocks of the burst count as progress.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._progress_at = now
             self._wait(now)
 
-    def _end(self, reply: FtpMessage) -> None:
+    def _finish_or_fail(self, reply: FtpMessage) -> None:
         if reply.is_ack or self._is_already_done(reply):
             self._finish(reply)
         else:

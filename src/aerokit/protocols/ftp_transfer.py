@@ -79,6 +79,7 @@ class _Burst:
         self.highest_at = sent_at  # time at which that block arrived; before it, the time of the request
 
     def blocks_before(self, reply: FtpMessage) -> int:
+        """Return how many blocks the server sent in this burst before this reply: each has the next sequence number."""
         return (reply.sequence - self.sequence - 1) % SEQUENCE_COUNT
 
     def contains(self, reply: FtpMessage) -> bool:
@@ -88,7 +89,7 @@ class _Burst:
     def file_end(self, reply: FtpMessage) -> int | None:
         """Return the end of the file, or None if this NAK does not belong to the burst."""
         blocks = self.blocks_before(reply)
-        if blocks == 0:
+        if blocks == 0:  # The burst began at or after the end.
             return self.offset
         last_offset = self.offset + (blocks - 1) * DATA_SIZE
         if not last_offset <= reply.offset <= last_offset + DATA_SIZE:

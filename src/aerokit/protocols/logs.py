@@ -190,7 +190,7 @@ class LogDownload(Transfer[int]):
 
     def _stream_range(self, start: int, end: int, now: float) -> None:
         """Request this range, or its beginning if it is too long for one request."""
-        self._adapt_range()
+        self._adapt_max_range()
         self._range_end = min(start + self._max_range_blocks * LOG_BLOCK, end, self._size)
         self._requested_blocks = math.ceil((self._range_end - start) / LOG_BLOCK)
         self._latest_offset = start - LOG_BLOCK
@@ -200,7 +200,8 @@ class LogDownload(Transfer[int]):
         self._stream.on_request(now)
         self._request(start, self._range_end - start)
 
-    def _adapt_range(self) -> None:
+    def _adapt_max_range(self) -> None:
+        """Adapt the maximum length of a range to the losses in the previous range."""
         # After a time-out, missing blocks do not show that the range was too long: the link may have failed.
         if self._stream.failures or not self._requested_blocks:
             return
@@ -225,30 +226,19 @@ class LogDownload(Transfer[int]):
 
 
 class LogStop(Transfer[None]):
-    """Sends LOG_REQUEST_END, which is not acknowledged, until the vehicle sends no more log data.
+    """Repeats LOG_REQUEST_END, which is not acknowledged, until the vehicle sends no more log data.
 
-    Args:
-        is_sent: True if the caller itself makes the first transmission.
+    The caller sends the first one (`message`).
     """
 
     expects: tuple[type[Message], ...] = (LogData, LogEntry)
-
-    def __init__(
-        self, target_system: int, target_component: int, *, is_sent: bool = False, **options: Unpack[TransferOptions]
-    ) -> None:
-        super().__init__(target_system, target_component, **options)
-        self._is_sent = is_sent
-        self._is_receiving = False
 
     @property
     def message(self) -> LogRequestEnd:
         return LogRequestEnd(self.target_system, self.target_component)
 
     def start(self, now: float) -> None:
-        """Send the request, unless ``is_sent``."""
         self._start_clock(now)
-        if not self._is_sent:
-            self._outbox.append(self.message)
         self._wait(now)
 
     def receive(self, message: Message, now: float) -> None:
@@ -309,7 +299,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if self.done or not isinstance(message, LogEntry) or not self._is_from_target(message):
             return
         if self._missing is None:
-            self._expect(message)
+            self._determine_missing(message)
         self._stream.on_message(now, message.id - self._previous_id)
         self._previous_id = message.id
         assert self._missing is not None
@@ -337,7 +327,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         else:
             self._request_missing(now)
 
-    def _expect(self, entry: LogEntry) -> None:
+    def _determine_missing(self, entry: LogEntry) -> None:
         """Determine the ids of the missing entries from the first entry."""
         last = self._first_id + entry.num_logs - 1
         if self._to_id is not None:

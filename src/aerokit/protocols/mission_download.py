@@ -127,9 +127,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         opaque_id = message.opaque_id
         if self._count is None:
             # PX4, whose window is 1, repeats MISSION_COUNT by itself, so its arrival does not measure the round trip.
-            may_be_repeated = self._window == 1
-            is_first_request = self._attempt == 1 and not self._restarts
-            if is_first_request and not may_be_repeated:
+            if self._attempt == 1 and not self._restarts and self._window > 1:
                 self.round_trip.add_sample(now - self._list_requested_at)
             # After a restart, the items received before stay valid only if the plan has the same id.
             if not opaque_id or opaque_id != self._opaque_id:
@@ -207,7 +205,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     def _proceed(self, now: float) -> None:
         if len(self._items) >= len(self._indices):
-            self._end()
+            self._acknowledge_and_finish()
             return
         while self._next_position < len(self._indices) and len(self._requested_at) < self._window:
             seq = self._indices[self._next_position]
@@ -237,7 +235,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     # ------------------------------------------------------------------------------------ end
 
-    def _end(self) -> None:
+    def _acknowledge_and_finish(self) -> None:
         # If PX4 (window 1) misses the acknowledgement, it accepts no upload for 5 s. PX4 therefore gets two of them.
         transmissions = 2 if self._window == 1 else 1
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions

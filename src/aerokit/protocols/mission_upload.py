@@ -65,7 +65,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     # start() sets this attribute.
     _received_at: float
     # The first request sets this attribute.
-    _as_float: bool
+    _sends_floats: bool
 
     def __init__(
         self,
@@ -94,14 +94,14 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._reset()
 
     def _reset(self) -> None:
-        self._is_requesting = False  # True once the vehicle has requested an item after the latest announcement
+        self._vehicle_has_requested = False  # True once the vehicle has requested an item after the latest announcement
         self._confirmed_end = self._first  # The vehicle has all items before this one.
         self._sent_end = self._first  # All items before this one were sent at least once.
         self._sent_at: dict[int, float] = {}
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
         self._error_at: float | None = None  # time of the first ERROR since the last progress
-        self._was_tail_repeated = False  # True if several items at the end were repeated; see `_send_window`
+        self._was_tail_repeated = False  # True if several items at the end were repeated; see `_repeat_unconfirmed`
         self._attempt = 1
 
     @property
@@ -121,7 +121,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def start(self, now: float) -> None:
         self._start_clock(now)
         self._received_at = now
-        self._announce(now)
+        self._announce_items(now)
 
     def receive(self, message: Message, now: float) -> None:
         if not self._is_ours(message):
@@ -130,13 +130,13 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._received_at = now
         if isinstance(message, MissionAck):
             # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
-            has_expired = self._is_requesting and silence_s >= TRANSFER_EXPIRY_S
+            has_expired = self._vehicle_has_requested and silence_s >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(message.type, now)
             else:
                 self._on_ack(message, now)
         elif isinstance(message, (MissionRequestInt, MissionRequest)) and self._first <= message.seq < self._end:
-            self._as_float = isinstance(message, MissionRequest) and not self._supports_int
+            self._sends_floats = isinstance(message, MissionRequest) and not self._supports_int
             self._on_request(message.seq, now)
 
     def expire(self, now: float) -> None:
@@ -144,23 +144,23 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._time_out(now)
             return
         self._attempt += 1
-        if not self._is_requesting:
-            self._announce(now)
+        if not self._vehicle_has_requested:
+            self._announce_items(now)
         elif self._sent_end < self._end:
             may_send_ahead = self._window > 1  # With a window of 1, items are only sent on request.
-            self._send_window(now, ahead=1 if may_send_ahead else 0)
+            self._repeat_unconfirmed(now, ahead=1 if may_send_ahead else 0)
         elif self._attempt % 2 == 0:
             # If the confirmation was lost, the vehicle repeats it when it receives the last item again.
             self._send(self._end - 1, now)
         else:
-            self._send_window(now)
+            self._repeat_unconfirmed(now)
         self._wait(now)
 
     def link_changed(self, now: float) -> None:
         """Announce the items again, because PX4 accepts items only over the port that received MISSION_COUNT."""
-        if self._is_requesting and not self.is_partial and not self.done:
+        if self._vehicle_has_requested and not self.is_partial and not self.done:
             self._reset()
-            self._announce(now)
+            self._announce_items(now)
 
     # ------------------------------------------------------------------------------- requests
 
@@ -168,24 +168,24 @@ class MissionUpload(MissionExchange[UploadResult]):
         # The vehicle never skips an item, so a request beyond the next unsent item belongs to another transfer.
         if seq > self._sent_end:
             return
-        if not self._is_requesting:
-            self._is_requesting = True
+        if not self._vehicle_has_requested:
+            self._vehicle_has_requested = True
             self.was_started = True
             self._busy_until = None
             self._report_progress(now, 0, len(self._items))
         if seq > self._confirmed_end:
-            self._advance(seq, now)
+            self._confirm_items_before(seq, now)
         elif seq < self._confirmed_end:
             # The vehicle has restarted the transfer, or this is a delayed request.
             self._send(seq, now, unless_in_flight=True)
         elif seq in self._requested:
-            self._send_window(now)  # The item was lost, and the vehicle has ignored the items after it.
+            self._repeat_unconfirmed(now)  # The item was lost, and the vehicle has ignored the items after it.
         self._requested.add(seq)
         while self._sent_end < min(self._end, self._confirmed_end + self._window):
             self._send(self._sent_end, now)
         self._wait(now)
 
-    def _advance(self, seq: int, now: float) -> None:
+    def _confirm_items_before(self, seq: int, now: float) -> None:
         """Record that the vehicle has all items before ``seq``."""
         if self._send_counts.get(seq - 1) == 1:  # After a repetition, it is unknown which transmission was answered.
             self._measure(now - self._sent_at[seq - 1])
@@ -203,31 +203,36 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_ack(self, ack: MissionAck, now: float) -> None:
         result = ack.type
+        # Before the vehicle requests an item, ERROR refuses a partial upload. In other cases it has several meanings.
+        is_refusal = self.is_partial and not self._vehicle_has_requested
         if result == MavMissionResult.ACCEPTED:
-            # Before all items were sent, an ACCEPTED can only answer an earlier upload.
-            if self._is_requesting and self._sent_end == self._end:
-                # We may send the last item before the vehicle requests it. Until the vehicle does, an ACCEPTED may be a
-                # delayed answer to an earlier upload.
-                was_last_requested = self._confirmed_end == self._end - 1
-                is_confirmed = was_last_requested and not self._was_tail_repeated
-                self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
+            self._on_accepted(ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
-            if self._is_requesting:
+            if self._vehicle_has_requested:
                 # The vehicle answers so if it already has the item, or if a preceding item is missing.
-                self._send_window(now, ahead=1)
+                self._repeat_unconfirmed(now, ahead=1)
                 if self._outbox:  # If nothing was sent, the present deadline stays.
                     self._wait(now)
         elif result == MavMissionResult.OPERATION_CANCELLED:
             self._restart(result, now)
-        elif result == MavMissionResult.ERROR and (self._is_requesting or not self.is_partial):
+        elif result == MavMissionResult.ERROR and not is_refusal:
             self._on_error(now)
         else:
             self._fail_as_refused(result)
 
+    def _on_accepted(self, opaque_id: int, now: float) -> None:
+        # Before all items were sent, an ACCEPTED can only answer an earlier upload.
+        if self._vehicle_has_requested and self._sent_end == self._end:
+            # We may send the last item before the vehicle requests it. Until the vehicle does, an ACCEPTED may be a
+            # delayed answer to an earlier upload.
+            was_last_requested = self._confirmed_end == self._end - 1
+            is_confirmed = was_last_requested and not self._was_tail_repeated
+            self._succeed(now, is_confirmed=is_confirmed, opaque_id=opaque_id)
+
     def _on_error(self, now: float) -> None:
         # ERROR need not mean that the upload has failed. PX4 also sends it when it is busy, when MISSION_COUNT arrives
         # twice and, like ArduPilot, for an item after the end.
-        if not self._is_requesting:
+        if not self._vehicle_has_requested:
             self._wait_while_busy(now)
         elif self._error_at is None:  # Repeat an item. The upload ends only with another ERROR.
             self._error_at = now
@@ -253,7 +258,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _restart(self, result: int, now: float) -> None:
         """Begin again or, if the upload must not begin again, fail with ``result`` (a MAV_MISSION_RESULT)."""
-        if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
+        if not self._vehicle_has_requested:  # The vehicle has cancelled an older transfer, not this one.
             return
         # A partial upload does not begin again, because another station may have changed the vehicle's plan since.
         if self.is_partial or self._restarts >= MAX_RESTARTS:
@@ -261,11 +266,11 @@ class MissionUpload(MissionExchange[UploadResult]):
             return
         self._restarts += 1
         self._reset()
-        self._announce(now)
+        self._announce_items(now)
 
     def _fail_as_refused(self, result: int) -> None:
         self.is_refusal_ambiguous = self._sent_end - self._confirmed_end > 1
-        self._reject(result, seq=self._confirmed_end if self._is_requesting else None)
+        self._reject(result, seq=self._confirmed_end if self._vehicle_has_requested else None)
 
     def _succeed(self, now: float, *, is_confirmed: bool, opaque_id: int) -> None:
         self._report_progress(now, len(self._items), len(self._items))
@@ -288,7 +293,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     # -------------------------------------------------------------------------------- sending
 
-    def _announce(self, now: float) -> None:
+    def _announce_items(self, now: float) -> None:
         target = (self.target_system, self.target_component)
         if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
             self._outbox += self.cancellation()
@@ -299,7 +304,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._outbox.append(MissionCount(*target, self._end, self.mission_type))
         self._wait(now)
 
-    def _send_window(self, now: float, *, ahead: int = 0) -> None:
+    def _repeat_unconfirmed(self, now: float, *, ahead: int = 0) -> None:
         """Repeat the unconfirmed items, and send up to ``ahead`` further items."""
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
             # PX4 may take any repeated item near the end for the last item, and confirm the upload although it does
@@ -313,7 +318,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _send(self, seq: int, now: float, *, unless_in_flight: bool = False) -> None:
         if unless_in_flight and self._is_in_flight(seq, now):
             return
-        make_message = to_wire_float if self._as_float else to_wire
+        make_message = to_wire_float if self._sends_floats else to_wire
         self._outbox.append(
             make_message(
                 self._items[seq - self._first],

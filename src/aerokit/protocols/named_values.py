@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
-from aerokit.protocols.exchange import Transfer, format_ranges
+from aerokit.protocols.exchange import StaleAnswerFilter, Transfer, format_ranges
 from aerokit.protocols.request_window import DEFAULT_SIZE, RequestWindow
 
 if TYPE_CHECKING:
@@ -139,21 +139,20 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout errors.
     """
 
+    window_size: ClassVar[int]  # initial limit of requests in flight
+    _may_probe = False  # True to detect unknown names by a probe. No request is then sent as two copies.
+
     def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        names: Iterable[str],
-        *,
-        window: int,
-        duplicate_last: bool = True,
-        **options: Unpack[TransferOptions],
+        self, target_system: int, target_component: int, names: Iterable[str], **options: Unpack[TransferOptions]
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._names = tuple(dict.fromkeys(names))
-        self._window: RequestWindow[str] = RequestWindow(self.round_trip, size=window, duplicate_last=duplicate_last)
+        self._window: RequestWindow[str] = RequestWindow(
+            self.round_trip, size=self.window_size, duplicate_last=not self._may_probe
+        )
         self._results: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
         self._sent_at: dict[str, float] = {}
+        self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -185,7 +184,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _timeout_text(self, name: str) -> str:
         return f"{name} was not answered, requested {self._window.attempts(name)} times"
 
-    def _check_overdue(self, now: float) -> None: ...
+    def _process_overdue(self, now: float) -> None: ...
 
     def _send_probe_if_wanted(self, now: float) -> None: ...
 
@@ -196,7 +195,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
     def _proceed(self, now: float) -> None:
         if len(self._results) < len(self._names):
-            self._check_overdue(now)  # This call may set the last results.
+            self._process_overdue(now)  # This call may set the last results.
         if len(self._results) == len(self._names):
             self._finish({name: self._results[name] for name in self._names})
             return
@@ -235,9 +234,18 @@ class NamedReads(NamedRequests[ValueT]):
         if self._is_probe_wanted and PROBE not in self._window:
             self._window.record_sent(PROBE, now)
             self._outbox += self._request(PROBE)
+            self._sent_at[PROBE] = now
         self._is_probe_wanted = False
 
-    def _count_probe(self) -> None:
+    def _is_probe_answer(self, index: int, now: float) -> bool:
+        attempts = self._window.attempts(PROBE)
+        if index != PROBE_INDEX or not attempts:
+            return False
+        # After a pause of the link, the answers to earlier probes arrive together. If each of them counted, all names
+        # without an answer would be rejected at once.
+        return not self._stale_answers.is_stale(PROBE, self._sent_at[PROBE], now, attempts=attempts)
+
+    def _count_probe_answer(self) -> None:
         # There cannot be more answers than requests, so further answers are duplicates.
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 

@@ -16,8 +16,7 @@ from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamValue
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
-from aerokit.protocols.exchange import StaleAnswerFilter
-from aerokit.protocols.named_values import BY_NAME, PROBE, PROBE_INDEX, NamedReads, NamedRequests, RepeatedAnswers
+from aerokit.protocols.named_values import BY_NAME, PROBE, NamedReads, NamedRequests, RepeatedAnswers
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -54,14 +53,10 @@ class ParameterRequests(NamedRequests[Parameter]):
         names: Iterable[str],
         *,
         bytewise: bool,
-        window: int,
-        duplicate_last: bool = True,
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(
-            target_system, target_component, names, window=window, duplicate_last=duplicate_last, **options
-        )
+        super().__init__(target_system, target_component, names, **options)
         self._bytewise, self._own_system = bytewise, own_system
 
     def _on_message(self, message: Message, now: float) -> None:
@@ -72,6 +67,10 @@ class ParameterRequests(NamedRequests[Parameter]):
 
     @abstractmethod
     def _on_value(self, message: ParamValue, now: float) -> None: ...
+
+    def _request_again(self, name: str, now: float) -> None:
+        self._window.on_answer(name, now)
+        self._window.request(name)
 
     def _on_error(self, message: ParamError, now: float) -> None:
         name = message.param_id  # The index and the target ids are not used, because PX4 does not initialise them.
@@ -84,9 +83,6 @@ def rejection(name: str, code: int) -> ParameterRejected:
     """Create the exception for a PARAM_ERROR (https://mavlink.io/en/messages/common.html#PARAM_ERROR)."""
     reason = ERRORS.get(code, f"MAV_PARAM_ERROR {code}")
     return ParameterRejected(f"{name} was refused: {reason}", name=name, code=code)
-
-
-READ_WINDOW = 20
 
 
 class ParameterReads(ParameterRequests, NamedReads[Parameter]):
@@ -103,6 +99,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """
 
     unknown_text = "the vehicle has no parameter"
+    window_size = 20
 
     def __init__(
         self,
@@ -117,17 +114,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(
-            target_system,
-            target_component,
-            names,
-            bytewise=bytewise,
-            window=READ_WINDOW,
-            duplicate_last=not probe,
-            own_system=own_system,
-            **options,
-        )
         self._may_probe = probe
+        super().__init__(target_system, target_component, names, bytewise=bytewise, own_system=own_system, **options)
         self._is_probe_wanted = probe
         self._possibly_stale = dict(possibly_stale)
         self._refused_once: set[str] = set()
@@ -136,31 +124,33 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
 
-    def _check_overdue(self, now: float) -> None:
+    def _process_overdue(self, now: float) -> None:
         if self._may_probe and (overdue := self._overdue(now)):
             self._reject_if_requested_often(overdue, now)
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        # An answer to another station also counts. This does no harm, because a name is rejected only after several
-        # probes (see `_loss_probability`).
-        is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
-        if is_probe_answer:
-            self._count_probe()
-            lost = self._window.on_answer(PROBE, now, loss_threshold=1)
-            if lost:
-                self._reject_if_requested_often(lost, now)
-                self._is_probe_wanted = True
+        # The probe requests index 0, which every vehicle has. An answer to another station also counts. This does no
+        # harm, because a name is rejected only after several probes (see `_loss_probability`).
+        if self._is_probe_answer(message.param_index, now):
+            self._on_probe_answer(now)
         name = message.param_id
         if name and name in self._window:
-            self._window.on_answer(name, now)
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # A delayed message may contain the old value, so we read once more.
+                self._request_again(name, now)  # A delayed message may contain the old value.
             else:
+                self._window.on_answer(name, now)
                 self._set_result(name, reported, now)
                 self._reject_alternatives(name, now)
+
+    def _on_probe_answer(self, now: float) -> None:
+        self._count_probe_answer()
+        unanswered = self._window.on_answer(PROBE, now, loss_threshold=1)  # all names requested before the probe
+        if unanswered:
+            self._reject_if_requested_often(unanswered, now)
+            self._is_probe_wanted = True
 
     def _reject_alternatives(self, name: str, now: float) -> None:
         for alternative in self._alternatives.get(name, ()):
@@ -174,16 +164,13 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         is_first = name in self._names and name in self._window and name not in self._refused_once
         if is_first and message.error == MavParamError.DOES_NOT_EXIST:
             self._refused_once.add(name)
-            self._window.on_answer(name, now)
-            self._window.request(name)
+            self._request_again(name, now)
         else:
             super()._on_error(message, now)
 
 
 # Seconds after the first PARAM_SET in which old values may still arrive, as late answers to earlier requests.
 LATE_ANSWERS_S = 1.5
-# Maximum number of writes in flight. ArduPilot saves through a queue of 30, which must not overflow while armed.
-WRITE_WINDOW = 10
 
 
 class ParameterWrites(ParameterRequests):
@@ -205,6 +192,8 @@ class ParameterWrites(ParameterRequests):
             write, so the value is read once more.
     """
 
+    window_size = 10  # ArduPilot saves through a queue of 30, which must not overflow while armed.
+
     def __init__(
         self,
         target_system: int,
@@ -219,26 +208,19 @@ class ParameterWrites(ParameterRequests):
     ) -> None:
         self._requested = {parameter.name: parameter for parameter in requested}
         super().__init__(
-            target_system,
-            target_component,
-            self._requested,
-            bytewise=bytewise,
-            window=WRITE_WINDOW,
-            own_system=own_system,
-            **options,
+            target_system, target_component, self._requested, bytewise=bytewise, own_system=own_system, **options
         )
         self._before = dict(before)
-        self._recently_written = set(recent)
-        self._may_be_late = frozenset(self._recently_written)  # names whose earlier values may arrive late
-        self._to_set = set(self._requested)  # names whose next request is a PARAM_SET
+        self._recently_written = frozenset(recent)
+        self._must_read_again = set(self._recently_written)
+        self._must_write = set(self._requested)  # names whose next request is a PARAM_SET
         self._repeated_answers: dict[str, RepeatedAnswers[Parameter]] = {}
-        self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
-        if name not in self._to_set:
+        if name not in self._must_write:
             return [read]
-        self._to_set.remove(name)
+        self._must_write.remove(name)
         requested = self._requested[name]
         write = set_message(
             self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
@@ -258,13 +240,12 @@ class ParameterWrites(ParameterRequests):
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         answers = self._repeated_answers.setdefault(name, RepeatedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
-        if is_as_requested and name in self._recently_written:
+        if is_as_requested and name in self._must_read_again:
             # The message may be the late answer to a write of this name by an earlier call, so the value is read once
             # more.
-            self._recently_written.remove(name)
+            self._must_read_again.remove(name)
             answers.add(reported)
-            self._window.on_answer(name, now)
-            self._window.request(name)
+            self._request_again(name, now)
             return
         # The requested value with another type is accepted when it is reported a second time.
         if is_as_requested and (reported.type == requested.type or answers.ends_with(reported)):
@@ -274,28 +255,28 @@ class ParameterWrites(ParameterRequests):
         self._on_unexpected_value(name, reported, now, is_as_requested=is_as_requested)
 
     def _on_unexpected_value(self, name: str, reported: Parameter, now: float, *, is_as_requested: bool) -> None:
-        """Write or read again, unless enough equal answers have arrived.
+        """Write or read again. Enough equal answers end the write instead.
 
         With ``is_as_requested``, only the type of the value is unexpected.
         """
         answers = self._repeated_answers[name]
         sent_at = self._sent_at.get(name, now)
-        if self._stale_answers.refuses(name, sent_at, now, attempts=self._window.attempts(name)):
+        if self._stale_answers.is_stale(name, sent_at, now, attempts=self._window.attempts(name)):
             return
         answers.add(reported)
         before = self._before.get(name)  # None if unknown
         may_be_unchanged = before is None or same_value(reported.value, before)
         if may_be_unchanged and not is_as_requested:
-            self._to_set.add(name)  # The vehicle may still have the old value, so PARAM_SET is sent again.
+            self._must_write.add(name)  # The vehicle may still have the old value, so PARAM_SET is sent again.
         is_conclusive = answers.are_conclusive(is_unchanged=may_be_unchanged)
-        may_be_late = may_be_unchanged or name in self._may_be_late
+        may_be_late = may_be_unchanged or name in self._recently_written
         if is_conclusive and may_be_late and now < self._started_at + LATE_ANSWERS_S:
-            return  # The request is repeated when it is overdue.
-        self._window.on_answer(name, now)
+            return  # These answers may be older than the write. The request is repeated when it is overdue.
         if is_conclusive:
+            self._window.on_answer(name, now)
             self._set_result(name, reported, now)
         else:
-            self._window.request(name)
+            self._request_again(name, now)
 
     def _with_integer_type(self, reported: Parameter, type_: ParameterType) -> Parameter:
         # If the value is the default, ArduPilot's answer to PARAM_SET reports an integer parameter as a float.

@@ -119,11 +119,11 @@ class RequestWindow(Generic[KeyT]):
             return []
         if request.attempts == 1:
             self._measure(now - request.first_at)
-        elif not request.was_duplicated:
+        elif not request.was_duplicated:  # It is unknown which attempt was answered. A second answer will tell.
             self._ambiguous[key] = now - request.first_at
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
-            # The answer may belong to the first transmission, so only requests sent before that one count as lost.
+            # The answer may belong to the first transmission, so requests sent after that one do not count as lost.
             if request_in_flight.last_number > request.first_number - loss_threshold:
                 break  # All further requests were sent later.
             lost.append(key_in_flight)

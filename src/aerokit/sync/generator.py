@@ -108,9 +108,9 @@ def _lines(arguments: Sequence[str], indent: str) -> str:
     lines = ""
     for argument in arguments:
         # Like ruff, break a line that is too long before `| None`.
-        head, none, tail = argument.rpartition(" | None")
-        if none and len(indent) + len(argument) + 1 > WIDTH:
-            argument = f"{head}\n{indent}{none.lstrip()}{tail}"
+        head, separator, tail = argument.rpartition(" | None")
+        if separator and len(indent) + len(argument) + 1 > WIDTH:
+            argument = f"{head}\n{indent}{separator.lstrip()}{tail}"
         lines += f"{indent}{argument},\n"
     return lines
 
@@ -175,8 +175,8 @@ class Page:
     """A generated file, and its imports."""
 
     name: str = "twins"
-    at_run_time: set[tuple[str, str]] = field(default_factory=set)
-    for_types: set[tuple[str, str]] = field(default_factory=set)
+    run_time_imports: set[tuple[str, str]] = field(default_factory=set)
+    typing_imports: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         self._import_sources: dict[str, tuple[str, str]] = {}  # imported name → (source module, name in it)
@@ -200,7 +200,7 @@ class Page:
 
     def _import_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
         if self._page_of_other_twins.get(name) == "twins":
-            self.at_run_time.add(("aerokit.sync.twins", name))
+            self.run_time_imports.add(("aerokit.sync.twins", name))
             return
         if name in self._twins or name in TYPE_VARIABLES or hasattr(builtins, name):
             return
@@ -210,9 +210,9 @@ class Page:
         # If several modules export a name, it is always imported from the module that was found first.
         origin = self._import_sources.setdefault(original_name or name, origin)
         if at_run_time:
-            self.at_run_time.add(origin)
+            self.run_time_imports.add(origin)
         else:
-            self.for_types.add(origin)
+            self.typing_imports.add(origin)
 
     def import_literals_in(self, node: ast.AST | None, module: str) -> None:
         """Import the Literals of an annotation at run time, because ``checked`` needs their values."""
@@ -225,7 +225,7 @@ class Page:
             if origin_module.startswith("aerokit."):
                 imported = getattr(importlib.import_module(origin_module), origin_name, None)
                 if get_origin(imported) is Literal:
-                    self.at_run_time.add((origin_module, origin_name))
+                    self.run_time_imports.add((origin_module, origin_name))
 
     def wrapped_in_twin(self, expression: str, returns: ast.expr | None) -> str:
         """Return the expression or, if its type has a twin, the expression that creates the twin."""
@@ -265,7 +265,7 @@ class Page:
     def _render_context_manager(
         self, node: ast.FunctionDef | ast.AsyncFunctionDef, member: ClassMember, arguments: Sequence[str]
     ) -> str:
-        self.for_types.add(("contextlib", "AbstractContextManager"))
+        self.typing_imports.add(("contextlib", "AbstractContextManager"))
         yielded = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
         returns = ast.Subscript(ast.Name("AbstractContextManager"), yielded)
         block = f"self.aio.{member.name}({', '.join(arguments)})"
@@ -295,35 +295,38 @@ TYPE_VARIABLES = {"ItemT": '"Message | Event"', "MessageT": '"Message"', "Setpoi
 
 
 def generate(name: str = "twins") -> str:
+    """Return the source of one of `FILES`."""
     page = Page(name)
     twins = [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
-    exports = [twin.name for twin in twins]
-    # `_class` and `_opener` have added the imports that their code needs. The following imports are needed in any case.
-    page.at_run_time |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
-    page.at_run_time |= {OPENERS[name], ("aerokit._internal.arguments", "checked")}
-    page.for_types |= {
-        (twin.module, f"{twin.name} as Async{twin.name}") for twin in twins if twin.base in GENERIC_BASES
-    }
+    _add_common_imports(page, twins)
     variables = TYPE_VARIABLES if name == "twins" else {}
-    page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
-    for path in FUNCTIONS[name]:
-        module, _, function_name = path.rpartition(".")
-        page.at_run_time.add((module, f"{function_name} as {function_name}_async"))
-        exports.append(function_name)
-    page.for_types -= page.at_run_time
     # Imports in HEAD that this file does not use are left out.
-    text = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
+    head = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
     if "@cached_property" not in "".join(classes):
-        text = text.replace("from functools import cached_property\n", "")
-    head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
-    head += _import_lines(page.for_types, "    ") + "\n"
+        head = head.replace("from functools import cached_property\n", "")
+    head += _import_lines(page.run_time_imports, "") + "\nif TYPE_CHECKING:\n"
+    head += _import_lines(page.typing_imports, "    ") + "\n"
+    exports = [*(twin.name for twin in twins), *(path.rpartition(".")[2] for path in FUNCTIONS[name])]
     head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in sorted(exports)) + "]\n"
     head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'
     return head + "\n\n" + "\n\n".join([*classes, *functions])
+
+
+def _add_common_imports(page: Page, twins: Sequence[Twin]) -> None:
+    """Add the imports that the file needs besides those that `_class` and `_opener` have added."""
+    page.run_time_imports |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
+    page.run_time_imports |= {OPENERS[page.name], ("aerokit._internal.arguments", "checked")}
+    for path in FUNCTIONS[page.name]:
+        module, _, function_name = path.rpartition(".")
+        page.run_time_imports.add((module, f"{function_name} as {function_name}_async"))
+    generic_twins = [twin for twin in twins if twin.base in GENERIC_BASES]
+    page.typing_imports |= {(twin.module, f"{twin.name} as Async{twin.name}") for twin in generic_twins}
+    page.typing_imports |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
+    page.typing_imports -= page.run_time_imports
 
 
 def _class(page: Page, twin: Twin) -> str:

@@ -51,7 +51,7 @@ class LoopThread:
         # The caller's context may name another async library, which sniffio would then report in the thread. The thread
         # therefore starts with an empty context.
         self._thread = threading.Thread(
-            target=contextvars.Context().run, args=(_run, self._calls, started), name="aerokit loop", daemon=True
+            target=contextvars.Context().run, args=(_run_loop, self._calls, started), name="aerokit loop", daemon=True
         )
         self._is_closed = False
         self._finalizer: weakref.finalize[Any, Any] | None = None
@@ -80,30 +80,30 @@ class LoopThread:
         KeyboardInterrupt. Raises BusyError on the loop's own thread, where the call would be a deadlock, and
         ConnectionClosed if the loop was closed before or during the call.
         """
-        return self._run(False, False, function, *args, **kwargs)
+        return self._run_call(function, args, kwargs)
 
     def run_shielded(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Like :meth:`run`, but after Ctrl-C wait without limit for the end of the function.
 
         Ctrl-C still cancels the function, which must itself shield its clean-up. A second Ctrl-C ends the wait.
         """
-        return self._run(True, True, function, *args, **kwargs)
+        return self._run_call(function, args, kwargs, is_shielded=True, must_start=True)
 
     def run_exit(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Like :meth:`run`, but start the function even if Ctrl-C came first. Used for the exit of a block.
 
         Ctrl-C then cancels the function after its start.
         """
-        return self._run(False, True, function, *args, **kwargs)
+        return self._run_call(function, args, kwargs, must_start=True)
 
-    def _run(
+    def _run_call(
         self,
-        is_shielded: bool,
-        must_start: bool,
-        function: Callable[P, Awaitable[T]],
-        /,  # Positional only, because the function itself may have arguments with these names.
-        *args: P.args,
-        **kwargs: P.kwargs,
+        function: Callable[..., Awaitable[T]],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        *,
+        is_shielded: bool = False,
+        must_start: bool = False,
     ) -> T:
         """Run a function. After Ctrl-C, cancel it and wait until it has ended, for a limited time.
 
@@ -152,14 +152,14 @@ class LoopThread:
         """Enter a context manager on the loop. The caller must exit it with :meth:`run_shielded`."""
         is_entered = False
 
-        async def enter() -> T:
+        async def enter_and_record() -> T:
             nonlocal is_entered
             value = await context.__aenter__()
             is_entered = True
             return value
 
         try:
-            return self.run_shielded(enter)
+            return self.run_shielded(enter_and_record)
         except BaseException as error:
             # Ctrl-C arrived after the context manager was entered, so the caller will not exit it.
             if is_entered:
@@ -408,7 +408,7 @@ class _Call(ThreadFuture[T]):
                 self.set_exception(error)
 
 
-def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
+def _run_loop(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
     """Run the loop. An error before the loop starts is stored in ``started``."""
     try:
         anyio.run(calls.run, started)

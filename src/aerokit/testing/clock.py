@@ -70,7 +70,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._executor_calls = 0  # number of calls that executor threads are running
         self._iterations = 0  # number of steps since the last poll, see `_POLL_EVERY`
         self._deadlock_timeout_s = deadlock_timeout_s
-        self._sources: list[tuple[Callable[[], float], asyncio.Handle]] = []  # `next_due` and `run` of each source
+        self._event_sources: list[
+            tuple[Callable[[], float], asyncio.Handle]
+        ] = []  # `next_due` and `run` of each source
         super().__init__(_JumpingSelector(self))
         selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
         self._registered: Mapping[Any, Any] = selector.get_map()
@@ -91,22 +93,23 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         a later time. Event sources run before timers of the same instant.
         """
         source = (next_due, asyncio.Handle(run, (), self))
-        self._sources.append(source)
+        self._event_sources.append(source)
 
         def remove() -> None:
-            if source in self._sources:
-                self._sources.remove(source)
+            if source in self._event_sources:
+                self._event_sources.remove(source)
 
         return remove
 
     def _run_once(self) -> None:
+        """Run the callbacks that are due. If none is, first let the clock jump to the next event source or timer."""
         self._iterations += 1
         ready = self._ready  # type: ignore[attr-defined]
         timers = self._scheduled  # type: ignore[attr-defined]
         # Without sockets, the loop polls only rarely, to notice signals and other threads.
         needs_poll = self._iterations >= _POLL_EVERY or not self._can_skip_polls
         if not needs_poll and not ready:
-            has_run = self._run_sources()
+            has_run = self._run_event_sources()
             # Without an event source or timer, only a signal or another thread can wake the loop.
             needs_poll = not has_run and self._next_timer() == math.inf
         cancelled_count = self._timer_cancelled_count  # type: ignore[attr-defined]
@@ -145,12 +148,12 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             heappop(timers)._scheduled = False
         return timers[0]._when if timers else math.inf
 
-    def _run_sources(self) -> bool:
+    def _run_event_sources(self) -> bool:
         """Run the event sources that are due before the next timer.
 
         Returns True if at least one has run. Stops when a callback is ready or the selector must be polled.
         """
-        sources = self._sources
+        sources = self._event_sources
         ready = self._ready  # type: ignore[attr-defined]
         can_skip_polls = self._can_skip_polls
         has_run = False
@@ -178,7 +181,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         timers = self._scheduled  # type: ignore[attr-defined]
         end = self._now + self._clock_resolution
         if timers and timers[0]._when < end:
-            self._ready.extend(handle for next_due, handle in self._sources if next_due() < end)  # type: ignore[attr-defined]
+            self._ready.extend(handle for next_due, handle in self._event_sources if next_due() < end)  # type: ignore[attr-defined]
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]
         """Run ``func`` on a thread. The clock stands still until ``func`` returns."""
@@ -211,7 +214,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             return events
         if self._executor_calls:
             return self._wait_in_real_time(poll)
-        if self._run_sources():
+        if self._run_event_sources():
             return []
         if timeout is None and self._may_be_woken():
             return self._wait_in_real_time(poll)

@@ -26,11 +26,11 @@ class FaultInjector:
     """
 
     # With slots, an attempt to set an attribute of `Faults` here raises AttributeError instead of having no effect.
-    __slots__ = ("_schedule_with", "_vehicle")
+    __slots__ = ("_vehicle", "_with_scheduler")
 
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:
         self._vehicle = vehicle
-        self._schedule_with = schedule_with
+        self._with_scheduler = schedule_with
 
     def when(self, condition: Callable[[TrackPoint], bool]) -> FaultInjector:
         """Return an injector that starts its faults when the true state of the vehicle first meets a condition.
@@ -42,10 +42,11 @@ class FaultInjector:
         def is_true() -> bool:
             return condition(true_point(self._vehicle))
 
-        def schedule_when_true(schedule: Callable[[FlightScheduler], None]) -> None:
-            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(schedule, scheduler)))
+        # The new injector gets the scheduler only when the condition is true, so its times count from then on.
+        def with_scheduler_when_true(schedule: Callable[[FlightScheduler], None]) -> None:
+            self._with_scheduler(lambda scheduler: scheduler.do_when(is_true, partial(schedule, scheduler)))
 
-        return FaultInjector(self._vehicle, schedule_when_true)
+        return FaultInjector(self._vehicle, with_scheduler_when_true)
 
     @property
     def all(self) -> Faults:
@@ -123,7 +124,7 @@ class FaultInjector:
     def _schedule(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):
             raise InvalidArgument(f"after_s = {after_s!r} is not allowed: it must be 0 or more")
-        self._schedule_with(lambda scheduler: scheduler.do(action, after_s=after_s))
+        self._with_scheduler(lambda scheduler: scheduler.do(action, after_s=after_s))
 
 
 def _duration(for_s: float) -> float:

@@ -97,8 +97,8 @@ class StalledQueue:
 
     def _new_outbox(self, peer: Peer) -> Outbox:
         outbox = Outbox(
-            partial(self._send_or_accept, peer=peer),
-            partial(self._accepted_bytes_of, peer),
+            send=partial(self._send_or_accept, peer=peer),
+            pending_bytes=partial(self._accepted_bytes_of, peer),
             limit=LIMIT,
             on_dropped=self._on_drop,
             on_stalled=partial(self._on_peer_stalled, peer),

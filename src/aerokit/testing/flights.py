@@ -52,7 +52,7 @@ class Flight:
         """True track of the vehicle."""
         self.journal: Journal = fleet._scheduler.journals[number]
         """Status texts that the vehicle sent, and messages that it received."""
-        self.faults: FaultInjector = FaultInjector(self.simulated, fleet._schedule_with)
+        self.faults: FaultInjector = FaultInjector(self.simulated, fleet._with_scheduler)
         """Injects faults."""
         self._vehicle: aerokit.Vehicle | None = None
 
@@ -223,7 +223,7 @@ class SimulatedFleet(Sequence[Flight]):
                 " use flight.run(main), and in a fixture `async with open_flight()`"
             )
 
-    def _schedule_with(self, schedule: Callable[[FlightScheduler], None]) -> None:
+    def _with_scheduler(self, schedule: Callable[[FlightScheduler], None]) -> None:
         """Call ``schedule`` with the scheduler at the current time, and run events that are due."""
         self._refresh()
         schedule(self._scheduler)

@@ -42,7 +42,9 @@ class ServedFlight:
         """True track of the vehicle."""
         self.journal: Journal = scheduler.journals[0]
         """Status texts that the vehicle sent, and messages that it received."""
-        self.faults: FaultInjector = FaultInjector(vehicle, lambda schedule: portal.call(self._schedule_with, schedule))
+        self.faults: FaultInjector = FaultInjector(
+            vehicle, lambda schedule: portal.call(self._with_scheduler, schedule)
+        )
         """Injects faults."""
         self.recording: FlightRecording | None = recording
         """Recording of the vehicle's link; None without ``record=True``."""
@@ -88,7 +90,7 @@ class ServedFlight:
             self._server.wake()
         self._scheduler.record()
 
-    def _schedule_with(self, schedule: Callable[[FlightScheduler], None]) -> None:
+    def _with_scheduler(self, schedule: Callable[[FlightScheduler], None]) -> None:
         self._refresh()
         schedule(self._scheduler)
         self._server.wake()

@@ -244,7 +244,7 @@ class BaseLink(Link):
         if self._receiver is not None:
             self._receiver.bytes_received(data, peer)
 
-    def _drop(self, writes: int) -> None:
+    def _count_dropped(self, writes: int) -> None:
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
@@ -351,12 +351,12 @@ class MemoryLink(BaseLink):
         self._far: MemoryLink | None = None  # the other end, set by `memory_link_pair`
         self._loop: asyncio.AbstractEventLoop | None = None  # None while the link is not open
         self._inbox: deque[_Arrival] = deque()
-        self._wake_up: asyncio.Handle | None = None  # pending call of `_arrive`
+        self._wake_up: asyncio.Handle | None = None  # pending call of `_deliver_due`
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. The far end receives the data in a later loop iteration."""
         if self._receiver is not None and self._far is not None:
-            self._far._post(bytes(data), self)
+            self._far._schedule_arrival(bytes(data), sender=self)
 
     async def _connect(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -370,9 +370,9 @@ class MemoryLink(BaseLink):
         self._loop = None
         if was_open and self._far is not None:
             # The far end delivers the data written so far, and then reports that the link is lost.
-            self._far._post(None, self)
+            self._far._schedule_arrival(None, sender=self)
 
-    def _post(self, data: bytes | None, sender: MemoryLink) -> None:
+    def _schedule_arrival(self, data: bytes | None, *, sender: MemoryLink) -> None:
         """Schedule the arrival of data. None means that ``sender`` was closed."""
         if self._loop is None or self._receiver is None:
             if data is not None:
@@ -380,14 +380,16 @@ class MemoryLink(BaseLink):
             return
         self._inbox.append(_Arrival(self._loop.time() + self._latency_s, data))
         if self._wake_up is None:
-            self._schedule(self._loop)
+            self._schedule_wake_up(self._loop)
 
-    def _schedule(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _schedule_wake_up(self, loop: asyncio.AbstractEventLoop) -> None:
         if not loop.is_closed():
             due = self._inbox[0].due
-            self._wake_up = loop.call_at(due, self._arrive) if self._latency_s else loop.call_soon(self._arrive)
+            self._wake_up = (
+                loop.call_at(due, self._deliver_due) if self._latency_s else loop.call_soon(self._deliver_due)
+            )
 
-    def _arrive(self) -> None:
+    def _deliver_due(self) -> None:
         self._wake_up = None
         if self._loop is None or not self._inbox:
             return
@@ -404,4 +406,4 @@ class MemoryLink(BaseLink):
             else:
                 self._deliver(data)
         if self._inbox and self._wake_up is None:
-            self._schedule(self._loop)
+            self._schedule_wake_up(self._loop)

@@ -229,7 +229,8 @@ class MultiLink(Link):
         receiver, error = self._receiver, self._last_loss
         if error is None or receiver is None or self._is_opening:
             return
-        if any(member.is_available for member in self._members) or self._lost_at is not None:
+        is_reported = self._lost_at is not None
+        if is_reported or any(member.is_available for member in self._members):
             return
         if self._survives_loss and self._may_come_back:
             self._lost_at = asyncio.get_running_loop().time()

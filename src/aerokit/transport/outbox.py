@@ -32,7 +32,7 @@ class Outbox:
 
     Args:
         send: writes bytes to the transport.
-        pending: returns the number of unsent bytes in the transport and the kernel.
+        pending_bytes: returns the number of unsent bytes in the transport and the kernel.
         limit: maximum number of buffered bytes.
         on_dropped: called with the number of dropped writes.
         on_stalled: called with True when waiting data stays for `STALLED_AFTER_S`, with False when it leaves again.
@@ -41,14 +41,14 @@ class Outbox:
     def __init__(
         self,
         send: Callable[[bytes], object],
-        pending: Callable[[], int],
+        pending_bytes: Callable[[], int],
         *,
         limit: int,
         on_dropped: Callable[[int], object],
         on_stalled: Callable[[bool], object],
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._send, self._pending, self._limit = send, pending, limit
+        self._send, self._pending_bytes, self._limit = send, pending_bytes, limit
         self._on_dropped, self._on_stalled = on_dropped, on_stalled
         self._waiting: deque[_WaitingWrite] = deque()
         self._waiting_bytes = 0
@@ -65,7 +65,7 @@ class Outbox:
 
     @property
     def unsent_bytes(self) -> int:
-        return self._waiting_bytes + self._pending()
+        return self._waiting_bytes + self._pending_bytes()
 
     def write(self, data: bytes) -> None:
         """Forward, buffer or drop data. Never blocks."""
@@ -166,7 +166,7 @@ class Outbox:
         """Drop outdated writes, and check whether data has left since the last poll."""
         self._timer = None
         self._drop_outdated()
-        pending_bytes, now = self._pending(), self._loop.time()
+        pending_bytes, now = self._pending_bytes(), self._loop.time()
         sent_bytes = self._forwarded_bytes - pending_bytes  # Forwarded bytes that are no longer pending have left.
         is_idle = not (pending_bytes or self._waiting or self._is_full)
         if sent_bytes != self._sent_bytes or is_idle:

@@ -190,12 +190,12 @@ class ReconnectingLink(Link):
             self._receiver.bytes_received(data, peer)
 
     def _on_lost(self, current: _CurrentReceiver, error: LinkLost) -> None:
-        if current is not self._current:
+        if current is not self._current:  # This link was replaced already.
             return
         self._is_up = False
         self._cancel_stable_timer()
         if isinstance(error, RecordingEnded):
-            self._end(error)
+            self._report_final_loss(error)
             return
         if self._lost_at is None:
             self._lost_at = asyncio.get_running_loop().time()
@@ -215,7 +215,7 @@ class ReconnectingLink(Link):
         except Exception as error:  # make_link() failed, or returned a link that can never be opened.
             lost = LinkLost(f"{self.address} cannot be reopened: {error}")
             lost.__cause__ = error
-            self._end(lost)
+            self._report_final_loss(lost)
         finally:
             self._reopening = None
 
@@ -251,7 +251,7 @@ class ReconnectingLink(Link):
         if isinstance(self._receiver, InterruptionListener):
             self._receiver.link_restored(away_s)
 
-    def _end(self, error: LinkLost) -> None:
+    def _report_final_loss(self, error: LinkLost) -> None:
         """Report that this link is lost for good. Nothing is called afterwards."""
         receiver, self._receiver, self._current = self._receiver, None, None
         if receiver is not None:

@@ -78,15 +78,15 @@ class SerialLink(BaseLink):
         if self._outbox is None or not self._loop or self._loop.is_closed():
             return
         self._outbox.discard()
-        bytes_before = self._waiting_to_be_sent(self._transport)
+        bytes_before = self._unsent_bytes_of(self._transport)
         self._transport.flush()  # In pyserial-asyncio, flush() discards the transport's buffer.
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
-        discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
+        discarded_bytes = bytes_before - self._unsent_bytes_of(self._transport)
         self._outbox.record_discarded(discarded_bytes)
         # The number of discarded writes is unknown, so they count as one.
         if discarded_bytes > 0:
-            self._drop(1)
+            self._count_dropped(1)
 
     async def _connect(self) -> None:
         # This method contains no await, so that it cannot be cancelled halfway.
@@ -99,10 +99,10 @@ class SerialLink(BaseLink):
         # can be discarded.
         self._transport.set_write_buffer_limits(high=0)
         self._outbox = Outbox(
-            self._transport.write,
-            partial(self._waiting_to_be_sent, self._transport),
+            send=self._transport.write,
+            pending_bytes=partial(self._unsent_bytes_of, self._transport),
             limit=limit,
-            on_dropped=self._drop,
+            on_dropped=self._count_dropped,
             on_stalled=self._report_stalled,
         )
 
@@ -153,12 +153,12 @@ class SerialLink(BaseLink):
 
     def _close_when_sent(self, transport: Any, deadline: float) -> None:
         assert self._loop is not None
-        if self._waiting_to_be_sent(transport) and self._loop.time() < deadline:
+        if self._unsent_bytes_of(transport) and self._loop.time() < deadline:
             self._loop.call_later(_LINGER_STEP_S, self._close_when_sent, transport, deadline)
         else:
             self._close_port(transport)
 
-    def _waiting_to_be_sent(self, transport: Any) -> int:
+    def _unsent_bytes_of(self, transport: Any) -> int:
         """Return the number of unsent bytes in the transport and the driver. 0 if the device is gone."""
         with contextlib.suppress(OSError):
             return int(transport.get_write_buffer_size() + self._port.out_waiting)
@@ -166,7 +166,7 @@ class SerialLink(BaseLink):
 
     def _close_port(self, transport: Any) -> None:
         """Close the port without waiting for unsent data."""
-        unsent = self._waiting_to_be_sent(transport)
+        unsent = self._unsent_bytes_of(transport)
         with contextlib.suppress(RuntimeError):  # The loop may be closed.
             # `_release` has already called pause_reading(), but before the transport's first loop iteration that call
             # has no effect.
@@ -290,7 +290,7 @@ class PtyLink(BaseLink):
         except OSError:
             written = 0
         if written < len(data):
-            self._drop(1)
+            self._count_dropped(1)
 
     async def _connect(self) -> None:
         if sys.platform == "win32":

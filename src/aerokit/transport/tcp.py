@@ -194,7 +194,7 @@ class TcpListen(_TcpLink):
         elif client_of_peer := self._clients.get(peer):
             client_of_peer.write(data)
         else:
-            self._drop(1)
+            self._count_dropped(1)
 
     def unsent_bytes_to(self, peer: Peer) -> int:
         stream = self._clients.get(peer)
@@ -250,7 +250,7 @@ class TcpListen(_TcpLink):
         if len(self._clients) < MAX_CLIENTS:
             return True
         unkept = next((peer for peer in self._clients if peer not in self._kept), None)
-        if not self._keeps_peers or unkept is None:
+        if not self._keeps_peers or unkept is None:  # Without a `PeerKeeper`, every client counts as kept.
             return False
         self._clients.pop(unkept).close()
         if isinstance(self._receiver, PeerListener):
@@ -298,7 +298,7 @@ class _Stream(asyncio.Protocol):
 
     def write(self, data: bytes) -> None:
         if self._outbox is None or self._transport is None or self._transport.is_closing():
-            self._link._drop(1)
+            self._link._count_dropped(1)
         else:
             self._outbox.write(data)
 
@@ -342,10 +342,10 @@ class _Stream(asyncio.Protocol):
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, NOT_SENT_LOW_WATER)
         self._fd = sock.fileno()
         self._outbox = Outbox(
-            transport.write,
-            self._pending,
+            send=transport.write,
+            pending_bytes=self._pending_bytes,
             limit=MAX_PENDING_BYTES,
-            on_dropped=self._link._drop,
+            on_dropped=self._link._count_dropped,
             on_stalled=lambda is_stalled: self._link._on_stalled(self, is_stalled),
         )
         self._link._add_stream(self)
@@ -366,7 +366,7 @@ class _Stream(asyncio.Protocol):
         if self._outbox is not None:
             self._outbox.resume()
 
-    def _pending(self) -> int:
+    def _pending_bytes(self) -> int:
         if self._transport is None or self._fd < 0:
             return 0
         return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)

@@ -149,7 +149,7 @@ class _UdpLink(BaseLink):
         try:
             self._socket.sendto(data, address)
         except OSError:
-            self._drop(1)
+            self._count_dropped(1)
 
 
 class UdpListen(_UdpLink):
@@ -180,7 +180,7 @@ class UdpListen(_UdpLink):
         elif peer in self._peers:
             self._send(data, peer)
         else:
-            self._drop(1)
+            self._count_dropped(1)
 
     def keep_peer(self, peer: Peer) -> None:
         self._peers[peer] = None

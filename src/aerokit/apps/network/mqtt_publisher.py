@@ -128,10 +128,10 @@ class MqttLink(BaseLink):
         """
         name = str(peer)
         if self._receiver is None or (name not in self._unsent and len(self._unsent) >= MAX_WAITING):
-            self._drop(1)
+            self._count_dropped(1)
             return
         if name in self._unsent:  # the new value replaces the unsent one
-            self._drop(1)
+            self._count_dropped(1)
         self._unsent[name] = data
         self._send_unsent()
 

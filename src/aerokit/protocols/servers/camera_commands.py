@@ -24,14 +24,14 @@ _CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
 def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
     pictures, videos, settings = _Pictures(camera), _Videos(camera), _Settings(camera)
     return {
-        MavCmd.IMAGE_START_CAPTURE: pictures.start,
-        MavCmd.IMAGE_STOP_CAPTURE: pictures.stop,
+        MavCmd.IMAGE_START_CAPTURE: pictures.start_capture,
+        MavCmd.IMAGE_STOP_CAPTURE: pictures.stop_capture,
         MavCmd.DO_DIGICAM_CONTROL: pictures.digicam_control,
-        MavCmd.STORAGE_FORMAT: pictures.format,
-        MavCmd.VIDEO_START_CAPTURE: videos.start,
-        MavCmd.VIDEO_STOP_CAPTURE: videos.stop,
-        MavCmd.VIDEO_START_STREAMING: lambda command: videos.stream(command, runs=True),
-        MavCmd.VIDEO_STOP_STREAMING: lambda command: videos.stream(command, runs=False),
+        MavCmd.STORAGE_FORMAT: pictures.format_storage,
+        MavCmd.VIDEO_START_CAPTURE: videos.start_capture,
+        MavCmd.VIDEO_STOP_CAPTURE: videos.stop_capture,
+        MavCmd.VIDEO_START_STREAMING: lambda command: videos.switch_stream(command, on=True),
+        MavCmd.VIDEO_STOP_STREAMING: lambda command: videos.switch_stream(command, on=False),
         MavCmd.SET_CAMERA_MODE: settings.set_mode,
         MavCmd.SET_CAMERA_ZOOM: settings.set_zoom,
         MavCmd.SET_CAMERA_FOCUS: settings.set_focus,
@@ -68,7 +68,7 @@ class _Pictures:
         self._camera = camera
         self._last_single: tuple[ComponentIds, int] | None = None  # sender and sequence number of the last single image
 
-    async def start(self, command: ReceivedCommand) -> int:
+    async def start_capture(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
         count = to_int(command.param3)
@@ -91,7 +91,7 @@ class _Pictures:
         captures.take_series(interval_s, count)
         return MavResult.ACCEPTED
 
-    async def stop(self, command: ReceivedCommand) -> int:
+    async def stop_capture(self, command: ReceivedCommand) -> int:
         if not _selects_this_camera(command.param1):
             return MavResult.DENIED
         self._camera.captures.stop()
@@ -100,9 +100,9 @@ class _Pictures:
     async def digicam_control(self, command: ReceivedCommand) -> int:
         if command.x != 1:  # Param 5 is 1 to take an image.
             return MavResult.ACCEPTED
-        return await self.start(replace(command, param1=0.0, param2=0.0, param3=1.0, param4=0.0))
+        return await self.start_capture(replace(command, param1=0.0, param2=0.0, param3=1.0, param4=0.0))
 
-    async def format(self, command: ReceivedCommand) -> int:
+    async def format_storage(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures
         if not _selects_this_camera(command.param1):
             return MavResult.DENIED
@@ -110,7 +110,7 @@ class _Pictures:
             return MavResult.TEMPORARILY_REJECTED
         if command.param2 == 1.0:
             await camera.format_storage()
-        if command.param3 == 1.0:
+        if command.param3 == 1.0:  # This parameter resets the image log.
             captures.clear()
         return MavResult.ACCEPTED
 
@@ -123,7 +123,7 @@ class _Videos:
         self._must_stop = False  # True from a command to stop until the next command to start
         self._was_cancelled = False  # True if a start was cancelled, so that the camera may be recording
 
-    async def start(self, command: ReceivedCommand) -> int:
+    async def start_capture(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures
         if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
             return MavResult.UNSUPPORTED
@@ -147,7 +147,7 @@ class _Videos:
             await self._stop_recording()
         return MavResult.ACCEPTED
 
-    async def stop(self, _: ReceivedCommand) -> int:
+    async def stop_capture(self, _: ReceivedCommand) -> int:
         self._must_stop = True
         await self._stop_recording()
         return MavResult.ACCEPTED
@@ -159,7 +159,7 @@ class _Videos:
             self._camera.captures.stop_recording()
             self._camera.host.send(self._camera.captures.status())
 
-    async def stream(self, command: ReceivedCommand, *, runs: bool) -> int:
+    async def switch_stream(self, command: ReceivedCommand, *, on: bool) -> int:
         camera, number = self._camera, to_int(command.param1)
         available = range(1, len(camera.streams) + 1)
         if not available:
@@ -167,8 +167,8 @@ class _Videos:
         if number not in (0, *available):
             return MavResult.DENIED
         selected = set(available) if number == 0 else {number}
-        await camera.switch_stream(selected, on=runs)
-        if runs:
+        await camera.switch_stream(selected, on=on)
+        if on:
             camera.running_streams |= selected
         else:
             camera.running_streams -= selected

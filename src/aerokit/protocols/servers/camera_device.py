@@ -224,7 +224,7 @@ class Captures:
 
     def _begin_image(self, series: int) -> None:
         camera = self._camera
-        if series != self._series or self._remaining == 0:
+        if series != self._series or self._remaining == 0:  # The series was replaced, or has ended.
             return
         if self._is_exposing:
             self._is_late = True
@@ -232,14 +232,14 @@ class Captures:
         if self._remaining != _UNLIMITED:
             self._remaining -= 1
         self._is_exposing = True
-        camera.expose(lambda image: self._finish(series, image))
+        camera.expose(lambda image: self._finish_image(series, image))
         if self._remaining:
             wait_s = max(self.interval_s, camera.shutter_s)
             camera.host.call_later(wait_s, lambda: self._begin_image(series))
 
-    def _finish(self, series: int, taken: CameraImageCaptured | None) -> None:
+    def _finish_image(self, series: int, taken: CameraImageCaptured | None) -> None:
         """Log and announce an image. None means that the device failed to take it."""
-        if series != self._series:
+        if series != self._series:  # The camera was switched off in the meantime.
             return
         self._is_exposing = False
         camera, index = self._camera, self.image_count

@@ -227,12 +227,12 @@ class RunningCommands:
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
         ended = self._ended.get((command.command, command.sender))
-        has_result = ended is not None and self._host.now - ended.ended_at <= RESULT_MAX_AGE_S
+        is_recent = ended is not None and self._host.now - ended.ended_at <= RESULT_MAX_AGE_S
         # A stop command is executed again, because it may be a new one whose first transmission was lost.
-        if ended is not None and has_result and not is_stop and _is_repeated(command, ended.command):
+        if ended is not None and is_recent and not is_stop and _is_repeated(command, ended.command):
             self._server.answer(command, **ended.result.to_dict())
             return None
-        if running is not None and is_stop and self._cancel_for(running, command):
+        if running is not None and is_stop and self._cancel(running, on_behalf_of=command):
             running = None
         if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
             self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
@@ -242,14 +242,15 @@ class RunningCommands:
         self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(started))
         return started
 
-    def _cancel_for(self, running: RunningCommand, command: ReceivedCommand) -> bool:
-        """Cancel a running command, because ``command`` stops it. Return False if it cannot be cancelled."""
-        del self._running[command.command]
+    def _cancel(self, running: RunningCommand, *, on_behalf_of: ReceivedCommand) -> bool:
+        """Cancel a running command for a stop command. Return False if it cannot be cancelled."""
+        key = running.command.command
+        del self._running[key]  # first, because `cancel` may finish the command, which would send its result
         if not running.cancel():
-            self._running[command.command] = running
+            self._running[key] = running
             return False
-        # A sender of both commands would take CANCELLED for the answer to `command`.
-        if running.command.sender != command.sender:
+        # The sender of both commands would take CANCELLED for the answer to the stop command.
+        if running.command.sender != on_behalf_of.sender:
             self._server.answer(running.command, MavResult.CANCELLED)
         return True
 

@@ -123,7 +123,7 @@ class TextMount(Mount):
             raise FileFault(EROFS)
         if path not in self._texts:
             raise FileFault(ENOENT)
-        return _Opened(None, _File(self._texts[path].encode()))
+        return _OpenFile(None, _File(self._texts[path].encode()))
 
     def entries(self) -> list[Entry]:
         return [Entry(name, self._REPORTED_SIZE) for name in self._texts]
@@ -154,7 +154,7 @@ class _File:
 _Folder = dict[str, "_File | _Folder"]
 
 
-class _Opened(FileHandle):
+class _OpenFile(FileHandle):
     """An open file in memory; it is read-only if ``tree`` is None."""
 
     def __init__(self, tree: FileTree | None, file: _File) -> None:
@@ -241,7 +241,7 @@ class FileTree:
             return mount.open(path_in_mount, writing=writing)
         if create:
             self._create(path)
-        return _Opened(self, self._file(path))
+        return _OpenFile(self, self._file(path))
 
     def _create(self, path: str) -> None:
         folder, name = self._parent(path)

@@ -251,7 +251,7 @@ class SessionFtpServer(Generic[FilesT]):
         number = self._new_number(client, request)
         session = FtpSession(number, file, size, is_writing=not is_reading)
         client.sessions[number] = session
-        self._watch(client, session)
+        self._close_when_idle(client, session)
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
     def _size(self, path: str, *, reading: bool) -> int:
@@ -262,7 +262,7 @@ class SessionFtpServer(Generic[FilesT]):
                 raise
             return 0
 
-    def _watch(self, client: ServedClient, session: FtpSession) -> None:
+    def _close_when_idle(self, client: ServedClient, session: FtpSession) -> None:
         """Schedule the time-out that closes the session."""
 
         def close_if_due() -> None:
@@ -272,7 +272,7 @@ class SessionFtpServer(Generic[FilesT]):
             if self._host.now < due_at:  # The client has sent a request since this call was scheduled.
                 self._host.call_at(due_at, close_if_due)
                 return
-            client.reply = None
+            client.reply = None  # A repeated request must not get a reply that still shows the session open.
             del client.sessions[session.number]
             session.next_block = None
             with suppress(FileFault):

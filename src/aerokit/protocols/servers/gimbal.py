@@ -201,8 +201,8 @@ class GimbalRequests:
             return MavResult.DENIED
         primary_system, primary_component, secondary_system, secondary_component = map(int, ids)
         gimbal.set_control(
-            primary=_owner(gimbal.primary, ComponentIds(primary_system, primary_component), sender),
-            secondary=_owner(gimbal.secondary, ComponentIds(secondary_system, secondary_component), sender),
+            primary=_new_controller(gimbal.primary, ComponentIds(primary_system, primary_component), sender),
+            secondary=_new_controller(gimbal.secondary, ComponentIds(secondary_system, secondary_component), sender),
         )
         return MavResult.ACCEPTED
 
@@ -307,7 +307,7 @@ def _scaled(deflection: float, limits: tuple[float, float]) -> float:
     return deflection * (maximum if deflection > 0 else -minimum)
 
 
-def _owner(current: ComponentIds, requested: ComponentIds, sender: ComponentIds) -> ComponentIds:
+def _new_controller(current: ComponentIds, requested: ComponentIds, sender: ComponentIds) -> ComponentIds:
     """Return the component that has control after a request for these ids."""
     if _SENDER in requested:
         return sender

@@ -131,7 +131,7 @@ class MissionServer:
         self._uploads.clear()
         self._clearing = None
 
-    def id(self, mission_type: int) -> int:
+    def opaque_id(self, mission_type: int) -> int:
         """Return the opaque id of a list, a checksum of its items. It is 0 for an empty list."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
@@ -144,8 +144,9 @@ class MissionServer:
 
     def current_message(self) -> m.MissionCurrent:
         return m.MissionCurrent(
-            seq=self.current, total=self.count(MavMissionType.MISSION), mission_id=self.id(MavMissionType.MISSION),
-            fence_id=self.id(MavMissionType.FENCE), rally_points_id=self.id(MavMissionType.RALLY),
+            seq=self.current, total=self.count(MavMissionType.MISSION),
+            mission_id=self.opaque_id(MavMissionType.MISSION), fence_id=self.opaque_id(MavMissionType.FENCE),
+            rally_points_id=self.opaque_id(MavMissionType.RALLY),
         )  # fmt: skip
 
     def store(self, mission_type: int, items: Sequence[MissionItem]) -> None:
@@ -204,7 +205,7 @@ class MissionServer:
         if (refusal := self._refusal(request, channel)) is not None:
             self._acknowledge(to, kind, refusal, channel)
         else:
-            self._host.send(m.MissionCount(*to, self.count(kind), kind, opaque_id=self.id(kind)), channel)
+            self._host.send(m.MissionCount(*to, self.count(kind), kind, opaque_id=self.opaque_id(kind)), channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         refusal = self._refusal(request, channel)
@@ -252,7 +253,7 @@ class MissionServer:
 
     def _request_first_item(self, upload: ListUpload) -> None:
         self._request_item(upload)
-        self._watch(upload)
+        self._schedule_check(upload)
 
     def _drop(self, upload: ListUpload) -> None:
         """End an upload without an answer to the client."""
@@ -260,7 +261,7 @@ class MissionServer:
 
     def _end(self, upload: ListUpload, result: int) -> None:
         self._drop(upload)
-        opaque_id = self.id(upload.mission_type) if result == _Result.ACCEPTED else 0
+        opaque_id = self.opaque_id(upload.mission_type) if result == _Result.ACCEPTED else 0
         self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
 
     def _request_item(self, upload: ListUpload) -> None:
@@ -268,7 +269,7 @@ class MissionServer:
         request_class = m.MissionRequestInt if upload.uses_int else m.MissionRequest
         self._host.send(request_class(*upload.client, upload.next, upload.mission_type), upload.channel)
 
-    def _watch(self, upload: ListUpload) -> None:
+    def _schedule_check(self, upload: ListUpload) -> None:
         """Schedule the next retry or the time-out."""
         due = min(upload.requested_at + self.retry_interval_s, upload.received_at + self.timeout_s)
         self._host.call_at(due, lambda: self._check(upload))
@@ -282,7 +283,7 @@ class MissionServer:
             return
         if self._host.now >= upload.requested_at + self.retry_interval_s:
             self._repeat(upload)
-        self._watch(upload)
+        self._schedule_check(upload)
 
     def _is_running(self, upload: ListUpload) -> bool:
         return self._uploads.get(self._key(upload.mission_type)) is upload
@@ -328,7 +329,7 @@ class MissionServer:
     def _finish(self, upload: ListUpload) -> None:
         upload.is_being_validated = True
 
-        def answer(result: int) -> None:
+        def answer(result: int) -> None:  # `validate` may call it now or later.
             if self._is_running(upload):
                 if result == _Result.ACCEPTED:
                     self.store(upload.mission_type, upload.items)
@@ -371,7 +372,7 @@ class MissionServer:
             return
         kind, *other_kinds = kinds
 
-        def answer(result: int) -> None:
+        def answer(result: int) -> None:  # `validate` may call it now or later.
             if result == _Result.ACCEPTED and self._clearing is request:
                 self.store(kind, ())
                 self._clear(other_kinds, request, channel)

@@ -91,7 +91,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def _new_number(self, client: ServedClient, request: FtpPacket) -> int:
         return request.session
 
-    def _watch(self, client: ServedClient, session: FtpSession) -> None:
+    def _close_when_idle(self, client: ServedClient, session: FtpSession) -> None:
         """Do nothing. The firmware closes an idle session only at a request for another session."""
 
     def _answer(self, client: ServedClient, request: FtpPacket) -> None:

@@ -110,7 +110,7 @@ class Px4MissionServer(MissionServer):
         return self.lists[MavMissionType.MISSION]
 
     def _store_if_changed(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
-        if mission_type not in self.lists or (items and opaque_id == self.id(mission_type)):
+        if mission_type not in self.lists or (items and opaque_id == self.opaque_id(mission_type)):
             return
         self.store(mission_type, items)
         self._opaque_ids[mission_type] = opaque_id
@@ -137,7 +137,7 @@ class Px4MissionServer(MissionServer):
             self._link(channel), state=state, client=client, mission_type=kind, next=0, end=count, received_at=now
         )
         self._links[channel] = link
-        self._watch(link)
+        self._schedule_check(link)
         return link
 
     def _drop(self, upload: ListUpload) -> None:
@@ -147,7 +147,7 @@ class Px4MissionServer(MissionServer):
     def _send_count(self, link: _Link) -> None:
         link.requested_at = self._px4.now
         kind = link.mission_type
-        self._px4.send(m.MissionCount(*link.client, link.end, kind, self.id(kind)), link.channel)
+        self._px4.send(m.MissionCount(*link.client, link.end, kind, self.opaque_id(kind)), link.channel)
 
     def _send_item(self, link: _Link, seq: int) -> None:
         item = self.item(link.mission_type, seq)
@@ -165,7 +165,7 @@ class Px4MissionServer(MissionServer):
             message = item_message_float(downloaded, place, seq, client, kind, int(is_current))
         self._px4.send(message, link.channel)
 
-    def _watch(self, upload: ListUpload) -> None:
+    def _schedule_check(self, upload: ListUpload) -> None:
         due = upload.received_at + self.timeout_s
         if self._link(upload.channel).is_retried:
             due = min(due, self._px4.now + self.retry_interval_s)

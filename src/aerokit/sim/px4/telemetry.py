@@ -277,7 +277,7 @@ def _servo_output(px4: Px4Vehicle) -> m.ServoOutputRaw:
 
 def _mission_current(px4: Px4Vehicle) -> m.MissionCurrent:
     mission, store = px4.mission, px4.missions
-    ids = (store.id(0), store.id(1), store.id(2))
+    ids = (store.opaque_id(0), store.opaque_id(1), store.opaque_id(2))
     total = mission.count or INVALID_INDEX
     return m.MissionCurrent(mission.current, total, mission.state, mission.mode, *ids)
 

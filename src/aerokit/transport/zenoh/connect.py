@@ -188,7 +188,7 @@ class ZenohConnect(NetworkLink):
         # The nonce tells programs with the same client name apart. A notice without a nonce is for all of them.
         if notice is None or notice.nonce not in (None, self._nonce):
             return
-        self._drop(notice.count)
+        self._count_dropped(notice.count)
         if isinstance(self._receiver, OrderRefusalListener):
             answers = rejection_frames(notice.answer)
             self._receiver.order_refused(notice.message, notice.reason, notice.lease_holder, answers)
@@ -205,12 +205,12 @@ class ZenohConnect(NetworkLink):
         """Send a datagram to the server, or drop it while no beacons arrive from there."""
         stamp = self._tracker.make_stamp(self._now())
         if stamp is None:
-            self._drop(1)
+            self._count_dropped(1)
             return
         try:
             self._publisher.put(data, attachment=stamp.encode())
         except Exception:  # zenoh raises various errors after its session has ended.
-            self._drop(1)
+            self._count_dropped(1)
 
     # ---------------------------------------------------------------------------------- supervision
 

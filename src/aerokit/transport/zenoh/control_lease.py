@@ -22,6 +22,9 @@ from aerokit.mavlink.messages import (
     CommandLong,
     FileTransferProtocol,
     MissionAck,
+    MissionClearAll,
+    MissionCount,
+    MissionWritePartialList,
     Statustext,
 )
 from aerokit.transport.zenoh.keys import Beacon, ControlMode, RefusalNotice, SendTime, Stamp
@@ -76,21 +79,15 @@ _MAX_NOTICES = 64  # The last notice is remembered for each message name, for at
 
 _READ_IDS = frozenset(message_id for message_id, (class_name, *_) in INDEX.items() if class_name in READ_MESSAGES)
 
-COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
-
-_MISSION_WRITES = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_LIST")
-
 
 def is_read_only(frame: Frame) -> bool:
     """Return True if clients without control may send this frame. Unknown messages count as commands."""
     if frame.message_id in _READ_IDS:  # Most frames need not be decoded.
         return True
-    if frame.message_id in (CommandLong.ID, CommandInt.ID):
-        return getattr(_decoded(frame), "command", 0) in READ_COMMANDS
-    if frame.message_id == FileTransferProtocol.ID:
-        payload: bytes = getattr(_decoded(frame), "payload", b"")
-        return len(payload) > _OPCODE_OFFSET and payload[_OPCODE_OFFSET] in READ_FILES
-    return False
+    message = _decoded(frame)
+    if isinstance(message, (CommandLong, CommandInt)):
+        return message.command in READ_COMMANDS
+    return isinstance(message, FileTransferProtocol) and message.payload[_OPCODE_OFFSET] in READ_FILES
 
 
 def rejection_frames(answer: bytes) -> tuple[bytes, ...]:
@@ -180,7 +177,7 @@ class ClientFilter:
                 reason = "this link is read-only (control=never)"
             else:
                 reason = f"{holder} has control"
-            notices += self._refuse(frame, _decoded(frame), reason, holder, now)
+            notices += self._refuse(frame, reason, now, holder=holder)
         return b"".join(accepted), notices
 
     def _has_name_conflict(self, nonce: int, mode: ControlMode, now: float) -> bool:
@@ -199,21 +196,15 @@ class ClientFilter:
             if is_read_only(frame):
                 self.refused += 1
             else:
-                notices += self._refuse(frame, _decoded(frame), "it arrived too late", None, now, is_late=True)
+                notices += self._refuse(frame, "it arrived too late", now, is_late=True)
         return notices
 
     def _refuse(
-        self,
-        frame: Frame,
-        message: Message | None,
-        reason: str,
-        holder: str | None,
-        now: float,
-        *,
-        is_late: bool = False,
+        self, frame: Frame, reason: str, now: float, *, holder: str | None = None, is_late: bool = False
     ) -> list[RefusalNotice]:
         """Count a refused frame. Return a notice, or nothing if one about this message was sent a moment ago."""
         self.refused += 1
+        message = _decoded(frame)
         name = f"message {frame.message_id}" if message is None else message.NAME
         # A late command gets no answer, because the client may have sent it again. The client would take an answer to
         # the first transmission for an answer to the second one.
@@ -246,29 +237,21 @@ def _decoded(frame: Frame) -> Message | None:
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
     """Return the frames by which a vehicle would reject a message. Empty if it needs no answer."""
-    fields: object = message  # The type is `object`, because the class Message does not declare these fields.
-    system: int = getattr(fields, "target_system", 0)
-    # A message for all components (0) is answered by the autopilot (1).
-    component: int = getattr(fields, "target_component", 0) or 1
-    answer: Message | None = None
-    if message.NAME in COMMANDS:
-        command: int = getattr(fields, "command", 0)
-        result = MavResult.TEMPORARILY_REJECTED
+    answer: Message
+    if isinstance(message, (CommandLong, CommandInt)):
         answer = CommandAck(
-            command,
-            result,
-            progress=0,
-            result_param2=0,
-            target_system=frame.system_id,
-            target_component=frame.component_id,
-        )
-    elif message.NAME in _MISSION_WRITES:
-        mission_type: int = getattr(fields, "mission_type", 0)
-        answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, mission_type)
-    if answer is None or system == 0:
+            message.command, MavResult.TEMPORARILY_REJECTED, progress=0, result_param2=0,
+            target_system=frame.system_id, target_component=frame.component_id,
+        )  # fmt: skip
+    elif isinstance(message, (MissionCount, MissionClearAll, MissionWritePartialList)):
+        answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, message.mission_type)
+    else:
+        return b""
+    if message.target_system == 0:
         return b""
     text = Statustext(MavSeverity.WARNING, f"{_TEXT_PREFIX}{reason}"[:_MAX_TEXT_LENGTH])
-    encoder = FrameEncoder(system, component)
+    # A message for all components (0) is answered by the autopilot (1).
+    encoder = FrameEncoder(message.target_system, message.target_component or 1)
     return encoder.encode(text) + encoder.encode(answer)
 
 

@@ -106,7 +106,7 @@ class ZenohListen(NetworkLink):
         elif peer in self._clients:
             self._put(self._keys.from_server(str(peer)), bytes(data), attachment)
         else:
-            self._drop(1)
+            self._count_dropped(1)
 
     def has_peer(self, peer: Peer) -> bool:
         return peer in self._clients
@@ -190,7 +190,7 @@ class ZenohListen(NetworkLink):
             return
         client.received_at = now
         stamp = Stamp.decode(attachment)
-        if not self._freshness.is_fresh(stamp, now) or stamp is None:
+        if not self._freshness.is_fresh(stamp, now) or stamp is None:  # Without a stamp, the datagram counts as late.
             self._send_notices(name, client.refuse_late(data, now), stamp)
             return
         # Do not tell the client that a duplicate or overtaken datagram was refused: the first copy or a newer datagram
@@ -267,7 +267,7 @@ class ZenohListen(NetworkLink):
         try:
             put()
         except Exception:  # zenoh raises various errors after its session has ended.
-            self._drop(1)
+            self._count_dropped(1)
 
 
 def _client_of(sample: Any) -> str:

@@ -195,7 +195,7 @@ class FileChannel:
             opcode,
             path=path,
             session=session,
-            is_sent=is_sent,
+            sent_by_caller=is_sent,
             data=b"" if opcode == MavFtpOpcode.TERMINATESESSION else path_bytes(path),
             round_trip=self.transfers.round_trip,
             idle_timeout_s=idle_timeout_s,
@@ -309,7 +309,7 @@ class LogChannel:
         """Tell the vehicle to stop sending. The next operation waits for the confirmation."""
         transfers = self._transfers
         # LOG_REQUEST_END is sent at once. The background task only repeats it.
-        exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)
+        exchange = LogStop(transfers.system_id, transfers.component_id, round_trip=transfers.round_trip)
 
         async def confirm() -> None:
             with suppress(AerokitError):

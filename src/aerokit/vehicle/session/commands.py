@@ -260,10 +260,10 @@ class CommandSender:
                 min_timeout_s=self._min_attempt_timeout_s(),
                 progress_timeout=options.progress_timeout,
                 on_progress=options.on_progress,
-                earlier_answers=len(pending_acks),
+                earlier_acks=len(pending_acks),
                 acks_per_sending=acks_per_sending,
                 order_status=order_status,
-                is_sent=was_just_sent,
+                sent_by_caller=was_just_sent,
             )
             run = ExchangeRun(self._connection, exchange)
             self._runs[key] = run
@@ -277,8 +277,8 @@ class CommandSender:
                 del self._runs[key], self._order_statuses[key]
                 # Acks arrive in the order of their commands. The acks received so far therefore belong to the oldest
                 # pending commands.
-                still_pending = pending_acks[exchange.answers :]
-                newly_pending = [self._connection.now()] * exchange.pending_answers
+                still_pending = pending_acks[exchange.final_acks :]
+                newly_pending = [self._connection.now()] * exchange.pending_acks
                 self._add_pending_acks(key, [*still_pending, *newly_pending])
 
     def _abort_run_of_ended_order(self, key: _Key) -> None:
