@@ -249,10 +249,10 @@ class GimbalDevice:
         secondary = (message.secondary_control_sysid, message.secondary_control_compid)
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
-    def update_manager(self, component_id: int, rank: int, *, is_old_gone: bool) -> None:
+    def update_manager(self, component_id: int, rank: int, *, is_known_manager_gone: bool) -> None:
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
-        elif self.manager_id is None or rank > self._manager_rank or is_old_gone:
+        elif self.manager_id is None or rank > self._manager_rank or is_known_manager_gone:
             self.manager_id = component_id
             self._manager_rank = rank
             self._newest_status = None  # The time stamps of the new manager are from another clock.
