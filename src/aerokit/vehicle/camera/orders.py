@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 from contextlib import suppress
@@ -213,30 +214,27 @@ class CameraOrders:
         if not order.is_newest or self._session.is_closed:
             return
         self.send_now(command, *params)
-        answered = anyio.Event()
-        errors: list[AerokitError] = []
+        failure: AerokitError | None = None
 
         async def confirm() -> None:
+            nonlocal failure
             try:
                 await self._confirm_stop(order, command, *params, is_awaited=is_awaited)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:
-                    errors.append(error)
+                    failure = error
                     if not is_awaited:
                         logger.warning("camera %s may not have stopped: %s", self.number, error)
-            except BaseException:
-                errors.append(ConnectionClosed("the async with block of this vehicle was left"))
-                raise
-            finally:
-                answered.set()
 
-        self._session.background.start(confirm, "aerokit end of a camera's block")
-        if not is_awaited:
+        task = self._session.background.start(confirm, "aerokit end of a camera's block")
+        if task is None or not is_awaited:
             return
-        await answered.wait()
-        if errors:
-            raise errors[0]
+        await asyncio.wait((task,))  # The task continues if this call is cancelled.
+        if task.cancelled():
+            raise ConnectionClosed("the async with block of this vehicle was left")
+        if failure is not None:
+            raise failure
 
     async def _confirm_stop(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
         """Wait for the acknowledgement of a stop command that was just sent, and repeat the command if necessary."""
