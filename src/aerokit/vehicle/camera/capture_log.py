@@ -128,7 +128,7 @@ class CaptureLog:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None  # PX4's trigger cannot send a capture again.
-        self._requested.append(index)  # A low index in the answer does not mean that the camera counts from 0 again.
+        self._requested.append(index)  # `_shows_reset` does not take the low index of the answer for a reset.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index):

@@ -74,8 +74,8 @@ class CameraOrders:
 
     # Topics of the orders given by this object.
     _ordered_topics: set[Topic]
-    # Set once `number` is known to be right. Before that, `number` is None, or a guess.
-    _is_found: anyio.Event
+    # Set once `number` is known to be right. Before that, it is None or a guess.
+    _is_number_confirmed: anyio.Event
 
     @property
     def is_autopilot_attached(self) -> bool:
@@ -163,7 +163,7 @@ class CameraOrders:
                     attempts=attempts,
                     **options,
                 )
-                self._is_found.set()  # A camera that accepts orders is there, so no other camera takes its place.
+                self._is_number_confirmed.set()  # A camera that accepts a command exists.
             except CommandRejected as error:
                 # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
@@ -173,11 +173,11 @@ class CameraOrders:
         self,
         order: Order,
         send: Callable[[], Awaitable[None]],
-        had_effect: Callable[[], Awaitable[bool | None]],
+        check_effect: Callable[[], Awaitable[bool | None]],
     ) -> None:
         """Send an order. It is sent again only if the camera reports that it had no effect.
 
-        ``had_effect`` asks the camera, and returns None if there is no answer. A newer order ends the retries.
+        ``check_effect`` asks the camera, and returns None if there is no answer. A newer order ends the retries.
         """
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
@@ -185,18 +185,18 @@ class CameraOrders:
                 return
             except CommandRejected:
                 # A repetition may be refused because the camera is executing an earlier transmission.
-                if attempt == 1 or not await had_effect():
-                    raise
-                return
+                if attempt > 1 and await check_effect():
+                    return
+                raise
             except CommandTimeout as error:
                 error.was_sent = error.was_sent or attempt > 1
-                is_executed = await had_effect() if order.is_newest else None
+                had_effect = await check_effect() if order.is_newest else None
                 if not order.is_newest:  # A newer order may have been given while the camera was asked.
                     error.args = (f"{error}; not sent again: {SUPERSEDED}",)
                     raise
-                if is_executed:
+                if had_effect:
                     return
-                if is_executed is None or attempt == MAX_ORDER_ATTEMPTS:
+                if had_effect is None or attempt == MAX_ORDER_ATTEMPTS:
                     raise
 
     def send_now(self, command: int, *params: float) -> None:
