@@ -466,16 +466,19 @@ class MissionControl(VehiclePlan["Mission"]):
             try:
                 await self._set_current_by_message(seq, timeout, sent)
             except OperationTimeout as error:
-                if not order.end:
+                if not order.end:  # The order has not ended, so the vehicle did not confirm it in time.
                     raise
-                # The item itself may have changed the mode: PX4 leaves MISSION for a return.
-                if order.is_newest:
-                    reported = self._tracker.current
-                    with anyio.move_on_after(END_GRACE_S):
-                        # A report from before the order does not confirm it.
-                        await reported.wait_until(lambda now: now == item and reported.updated_at > order.given_at)
-                        return
+                # The item itself may have ended the order by a change of the mode: PX4 leaves MISSION for a return.
+                if order.is_newest and await self._is_reported_soon(item, since=order.given_at):
+                    return
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
+
+    async def _is_reported_soon(self, item: int, *, since: float) -> bool:
+        reported = self._tracker.current
+        with anyio.move_on_after(END_GRACE_S):
+            await reported.wait_until(lambda current: current == item and reported.updated_at > since)
+            return True
+        return False
 
     async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand) -> None:
         from aerokit.protocols.missions import SetCurrentItem
