@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.calibration.values import CalibrationReport, CalibrationStep
 
 CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
+ALL_COMPASSES = 0  # as a bit mask
 REPORT_HZ = 4.0
 # Value of ESC_CALIBRATION with which ArduCopter calibrates the ESCs at its next boot.
 CALIBRATE_AT_BOOT = 3
@@ -170,7 +171,7 @@ async def _read_parameter(run: CalibrationRun, name: str) -> float:
 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
+    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, ALL_COMPASSES))
     percents: dict[int, int] = {}  # progress in percent by number of the compass
     reports: dict[int, MagCalReport] = {}  # final report by number of the compass
     has_news = asyncio.Event()  # set when a report or another progress has arrived
@@ -194,8 +195,8 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         return bool(compasses) and all(number in reports for number in compasses)
 
     with ExitStack() as cleanup:
-        # The mask 0 means all compasses. The other zeros mean no retry, no automatic saving, no delay and no reboot.
-        await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
+        retry = autosave = delay_s = autoreboot = 0
+        await run.start(ALL_COMPASSES, retry, autosave, delay_s, autoreboot, command=MavCmd.DO_START_MAG_CAL)
         session = run.session
         for message_type in (MagCalProgress, MagCalReport):
             cleanup.callback(session.connection.bus.attach(message_type, on_message, system_id=session.system_id))
@@ -214,7 +215,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     ]
     if failures:
         raise run.failure(f"{'; '.join(failures)}; the previous calibration is kept")
-    await run.command(MavCmd.DO_ACCEPT_MAG_CAL, 0)
+    await run.command(MavCmd.DO_ACCEPT_MAG_CAL, ALL_COMPASSES)
     fits = tuple(
         CompassFit(report.compass_id, report.fitness, (report.ofs_x, report.ofs_y, report.ofs_z))
         for _, report in sorted(reports.items())

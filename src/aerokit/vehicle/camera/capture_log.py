@@ -12,12 +12,7 @@ from aerokit.errors import CommandRejected
 from aerokit.events import ImageCaptured
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavResult
-from aerokit.vehicle.camera.capture import (
-    FEEDBACK_INDEX_RANGE,
-    UNIX_TIME_OF_1990_S,
-    Capture,
-    capture_of,
-)
+from aerokit.vehicle.camera.capture import FEEDBACK_INDEX_RANGE, UNIX_TIME_OF_1990_S, Capture, capture_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

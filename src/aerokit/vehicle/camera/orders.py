@@ -343,22 +343,21 @@ class MessageRequests:
 
         Raises CommandRejected if the camera does not support the message.
         """
-        refusal: CommandRejected | None = None
-        if message_type not in self._legacy_types:
-            try:
-                return await self._link.component.request(message_type, *params, where=where, timeout=timeout)
-            except OperationTimeout:
-                return None
-            except CommandRejected as error:
-                has_legacy_request = message_type in LEGACY_REQUESTS and not self._link.is_autopilot_attached
-                if not has_legacy_request or error.result not in MAYBE_UNSUPPORTED:
-                    raise
-                refusal = error
+        if message_type in self._legacy_types:
+            return await self._request_legacy(message_type, params, where, timeout)
+        try:
+            return await self._link.component.request(message_type, *params, where=where, timeout=timeout)
+        except OperationTimeout:
+            return None
+        except CommandRejected as error:
+            has_legacy_request = message_type in LEGACY_REQUESTS and not self._link.is_autopilot_attached
+            if not has_legacy_request or error.result not in MAYBE_UNSUPPORTED:
+                raise
+            refusal = error
         try:
             answer = await self._request_legacy(message_type, params, where, timeout)
-        except CommandRejected as error:
-            # If both requests were refused, the refusal of the standard request is raised.
-            raise refusal or error from None
+        except CommandRejected:  # The camera supports neither request.
+            raise refusal from None
         if answer is not None:
             self._legacy_types.add(message_type)
         return answer

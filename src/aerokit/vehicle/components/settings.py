@@ -370,17 +370,9 @@ class Settings:
             setting = setting.replace(index=old.index)
         new = self._known[setting.name] = self._with_definition(setting)
         if old is not None and not settings_equal(old.value, new.value):
-            transfers = self._transfers
-            transfers.connection.bus.publish(
-                SettingChanged(
-                    transfers.connection.now(),
-                    transfers.system_id,
-                    new.name,
-                    old.value,
-                    new.value,
-                    transfers.component_id,
-                )
-            )
+            transfers, now = self._transfers, self._transfers.connection.now()
+            event = SettingChanged(now, transfers.system_id, new.name, old.value, new.value, transfers.component_id)
+            transfers.connection.bus.publish(event)
 
     def _forget(self) -> None:
         self._known.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -111,9 +112,9 @@ class ReleaseCommand:
             except CommandTimeout:
                 if not self._is_manager_silent():
                     raise
-                # The manager was silent, and may have missed the command. Send it again at the manager's next
-                # HEARTBEAT. A late command does no harm: the manager ignores it if this program has lost control.
-                await self._wait_manager_heartbeat()
+                # The manager was silent, and may have missed the command. Send it again as soon as the manager is back.
+                # A late command does no harm: the manager ignores it if this program has lost control.
+                await self._orders.wait_for(lambda: not self._is_manager_silent(), Heartbeat, within_s=math.inf)
                 if self._is_still_due():
                     self._send()
                     await self._repeat_until_acknowledged()
@@ -152,20 +153,6 @@ class ReleaseCommand:
     def _is_manager_silent(self) -> bool:
         is_autopilot = self._manager_id == self._session.component_id
         return not is_autopilot and self._orders.registry.silent_for_s(self._manager_id) > SILENT_AFTER_S
-
-    async def _wait_manager_heartbeat(self) -> None:
-        received = asyncio.Event()
-
-        def on_heartbeat(heartbeat: Heartbeat) -> None:
-            frame = heartbeat.received_frame
-            if frame is not None and frame.component_id == self._manager_id:
-                received.set()
-
-        detach = self._session.connection.bus.attach(Heartbeat, on_heartbeat, system_id=self._session.system_id)
-        try:
-            await received.wait()
-        finally:
-            detach()
 
 
 # Seconds after which the manager's confirmation of our control is requested, and seconds to wait for it in total.

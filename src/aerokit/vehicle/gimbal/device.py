@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
     from aerokit.connection.bus import Detach
     from aerokit.mavlink.message import Message
-    from aerokit.mavlink.messages import (
-        GimbalDeviceInformation,
-        GimbalManagerInformation,
-        GimbalManagerStatus,
-    )
+    from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation, GimbalManagerStatus
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Topic
     from aerokit.vehicle.session.session import VehicleSession

@@ -484,7 +484,6 @@ class MissionControl(VehiclePlan["Mission"]):
         from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
-        target = (transfers.system_id, transfers.component_id)
         with transfers.limit(timeout):
             await self._context.lock.acquire()  # PX4 ignores MISSION_SET_CURRENT during a transfer.
         try:
@@ -492,7 +491,8 @@ class MissionControl(VehiclePlan["Mission"]):
             await self._vehicle_context.sender.await_recent_state(sent.order)
             await transfers.run(
                 SetCurrentItem(
-                    *target,
+                    transfers.system_id,
+                    transfers.component_id,
                     seq,
                     self._current_seq,
                     order_status=sent,

@@ -153,17 +153,9 @@ class ParameterStore:
     def _publish(self, old: Parameter | None, new: Parameter) -> None:
         if old is None or same_value(old.value, new.value):
             return
-        transfers = self._transfers
-        transfers.connection.bus.publish(
-            ParameterChanged(
-                transfers.connection.now(),
-                transfers.system_id,
-                new.name,
-                old.value,
-                new.value,
-                transfers.component_id,
-            )
-        )
+        transfers, now = self._transfers, self._transfers.connection.now()
+        event = ParameterChanged(now, transfers.system_id, new.name, old.value, new.value, transfers.component_id)
+        transfers.connection.bus.publish(event)
 
 
 CACHE_FORMAT = 1
