@@ -129,8 +129,9 @@ class CameraLink(CameraOrders):
 
     def bind(self, number: int, *, is_guess: bool = False) -> None:
         """Use the camera with this number. A guess is replaced by a later call, unless it has been given orders."""
-        has_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
-        if self._is_number_confirmed.is_set() or has_orders:
+        # Orders that were given to the guessed camera must not be repeated to another one.
+        has_given_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
+        if self._is_number_confirmed.is_set() or has_given_orders:
             return
         if not is_guess:
             self._is_number_confirmed.set()
@@ -335,10 +336,11 @@ class ActiveOperation:
         try:
             yield
         except BaseException as error:
-            if not self.order.was_sent or isinstance(error, CommandRejected):
+            cannot_have_started = not self.order.was_sent or isinstance(error, CommandRejected)
+            if cannot_have_started:
                 self.order.withdraw()
                 self.discard()
-            else:  # The camera may have started nevertheless.
+            else:
                 self.order.commit()
                 # Do not wait for the answer to the stop command, so that the error is raised without delay.
                 await self.stop(is_awaited=False)

@@ -312,11 +312,8 @@ class PhotoInterval:
     def _first_after_reset(self, capture: Capture) -> Capture | None:
         """Return the previous capture if it was the first after the camera began to count from 0 again."""
         previous, self._possible_first = self._possible_first, None
-        if (
-            self._log.reset_at > self._known_reset_at
-            and self._next_index is not None
-            and capture.index < self._next_index
-        ):
+        has_log_reset = self._log.reset_at > self._known_reset_at
+        if has_log_reset and self._next_index is not None and capture.index < self._next_index:
             self._possible_first = capture
             # A single low index could be corrupt, so two successive ones are needed.
             if previous is not None and capture.index == previous.index + 1:

@@ -92,9 +92,10 @@ class Winch(ReadOnly):
         order = self._context.arbiter.device_order(self._topic)
         status_before: m.WinchStatus | None = None
         for _ in range(2):  # The first requests may be lost in a silence.
-            if status_before is None:
-                status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
-                await self._context.sender.await_recent_state(order)  # The vehicle may have become silent.
+            status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
+            await self._context.sender.await_recent_state(order)  # The vehicle may have become silent.
+            if status_before is not None:
+                break
         await self._send(
             WinchActions.RELATIVE_LENGTH_CONTROL,
             length_m,

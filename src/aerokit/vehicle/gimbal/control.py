@@ -189,7 +189,7 @@ class GimbalControl:
         self._device: GimbalDevice | None = None
         self._control_request = ControlRequest(0, 0, is_primary=is_primary)  # `__aenter__` replaces it.
         # The error that describes the loss of control; None until control is lost.
-        self._taken: GimbalTaken | None = None
+        self._loss: GimbalTaken | None = None
         self._was_loss_raised = False
         self._was_entered = False
         self._is_ended = False
@@ -205,12 +205,12 @@ class GimbalControl:
     @property
     def is_held(self) -> bool:
         """True while your program is in control."""
-        return self._device is not None and self._taken is None and not self._is_ended
+        return self._device is not None and self._loss is None and not self._is_ended
 
     @property
     def is_taken(self) -> bool:
         """True if another station has taken control, or has released your control."""
-        return self._taken is not None
+        return self._loss is not None
 
     async def until_lost(self) -> tuple[int, int]:
         """Wait until control is lost; return the system and component id of the new controller, (0, 0) for none.
@@ -225,10 +225,10 @@ class GimbalControl:
         finally:
             detach()
         self._session.end.raise_if_ended()
-        if self._taken is None:
+        if self._loss is None:
             raise OperationRejected(f"{self._orders.name}: the block that had control has ended")
         self._was_loss_raised = True
-        return self._taken.system_id, self._taken.component_id
+        return self._loss.system_id, self._loss.component_id
 
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if control was lost.
@@ -236,11 +236,11 @@ class GimbalControl:
         Raises:
             GimbalTaken: another station has taken control, or the manager reports that no station has it.
         """
-        if self._taken is not None:
+        if self._loss is not None:
             self._was_loss_raised = True
-            taken = self._taken
+            loss = self._loss
             # Create a new exception each time, because an exception that is raised again also keeps its old tracebacks.
-            raise GimbalTaken(str(taken), system_id=taken.system_id, component_id=taken.component_id)
+            raise GimbalTaken(str(loss), system_id=loss.system_id, component_id=loss.component_id)
 
     async def __aenter__(self) -> Self:
         """Request control, and wait until the manager confirms it."""
@@ -275,7 +275,7 @@ class GimbalControl:
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Release control. If it was lost, and no call has reported that yet, raise GimbalTaken instead."""
-        if self._taken is not None:
+        if self._loss is not None:
             self._end()
             if error is None and not self._was_loss_raised:
                 self.raise_if_taken()
@@ -328,11 +328,11 @@ class GimbalControl:
 
     def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
         controller = self._controller_in(controllers)
-        if controller == self._orders.own_ids or self._taken is not None:
+        if controller == self._orders.own_ids or self._loss is not None:
             return
         system_id, component_id = controller
         holder = f"{system_id}/{component_id}" if controller != (0, 0) else "no controller"
-        self._taken = GimbalTaken(
+        self._loss = GimbalTaken(
             f"{self._orders.name}: control was lost: {holder} has control now",
             system_id=system_id,
             component_id=component_id,
@@ -351,7 +351,7 @@ class GimbalControl:
 
         def is_still_due() -> bool:
             # If another open block of this program has the same control, that block releases it when it ends.
-            return self._taken is None and not self._control_request.leave_release_to(requests)
+            return self._loss is None and not self._control_request.leave_release_to(requests)
 
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 

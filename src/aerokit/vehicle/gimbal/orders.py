@@ -159,7 +159,7 @@ class GimbalOrders:
                 commands = self.session.commands
                 await self.context.sender.run_command(
                     sent_order,
-                    commands.send_int if place else commands.send_long,
+                    commands.send_int if place else commands.send_long,  # Only COMMAND_INT can have a place.
                     command,
                     *params,
                     component_id=self.manager_id,

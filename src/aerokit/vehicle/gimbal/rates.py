@@ -68,7 +68,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._began_at = -math.inf
         self._order: Order | None = None
         # The error that describes the loss of control; None until control is lost.
-        self._taken: AerokitError | None = None
+        self._loss: AerokitError | None = None
         # Marks the gimbal as in use until it is closed, so that ``vehicle.gimbal`` does not become another gimbal.
         self._cleanup = ExitStack()
 
@@ -159,7 +159,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         try:
             self._orders.raise_if_taken()
         except AerokitError as error:
-            self._taken = error
+            self._loss = error
             return str(error)
         return SUPERSEDED if self._order is not None and not self._order.is_newest else None
 
@@ -168,8 +168,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         super()._stop(reason, hold=hold)
         if hold:
             stop_command.send_soon()
-        if self._taken is not None:
-            self._stop_error = self._taken
+        if self._loss is not None:
+            self._stop_error = self._loss
 
     def _zero_rates_command(self) -> ReleaseCommand:
         orders, order = self._orders, self._order

@@ -76,15 +76,14 @@ class MissionEndDetector:
         self._session = session
         self._tracker = tracker
         self._mode = mode
-        self._order = vehicle_context.arbiter.newest  # the newest order when the wait began
+        self._newest_order_at_start = vehicle_context.arbiter.newest
         last_command = items[-1].command if items else None
-        self._ending = Ending.OTHER
         if last_command is None:
             self._ending = Ending.UNKNOWN
         elif last_command == MavCmd.NAV_RETURN_TO_LAUNCH and not session.autopilot.lands_after_return:
             self._ending = Ending.RETURN
-        elif last_command in LANDING_PURPOSES:
-            self._ending = Ending.LANDING
+        else:
+            self._ending = Ending.LANDING if last_command in LANDING_PURPOSES else Ending.OTHER
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         # Modes in which the vehicle may land. If the last item is a landing or a return, only the mode of this item.
@@ -152,13 +151,13 @@ class MissionEndDetector:
         is_complete, lands = self._tracker.is_present_plan_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
 
-    def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
+    def failure(self, mission_order: Order | None, *, is_paused: bool) -> str | None:
         """Return the reason why the vehicle will not fly the mission to its end, or None.
 
-        ``order`` is the last order for the mission.
+        ``mission_order`` is the last order to start, pause or resume the mission.
         """
         session, now = self._session, self._session.connection.now()
-        if self._vehicle_context.arbiter.newest not in (self._order, order):
+        if self._vehicle_context.arbiter.newest not in (self._newest_order_at_start, mission_order):
             return "another order was given"
         fall = self.ground.fall()
         if fall:

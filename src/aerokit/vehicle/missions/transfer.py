@@ -315,7 +315,9 @@ class PlanTransfer(Generic[PlanT]):
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
-        if (result.is_confirmed and not verify) or await self._is_verified_by_checksum(items):
+        if result.is_confirmed and not verify:
+            return
+        if await self._is_verified_by_checksum(items):
             return
         try:
             await self._verify(items, method)
