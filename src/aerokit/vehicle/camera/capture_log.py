@@ -172,7 +172,8 @@ class CaptureLog:
             # Before the first picture, ArduPilot sends a message of zeros, which is not a capture. An index of 0
             # belongs to a picture only if the indices may have returned to 0.
             may_have_wrapped = self._highest is not None and self._highest.capture.index > HALF_RANGE
-            if (message.img_idx > 0 or may_have_wrapped) and message.cam_idx + 1 == self._link.number:
+            is_capture = message.img_idx > 0 or may_have_wrapped
+            if is_capture and message.cam_idx + 1 == self._link.number:
                 self._add(message, capture)
         elif isinstance(message, m.CameraTrigger) and self._link.is_autopilot_attached and not self._has_images:
             self._link.call_later(TRIGGER_GRACE_S, lambda: self._add_unless_reported(message, capture))

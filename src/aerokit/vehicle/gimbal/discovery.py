@@ -42,6 +42,7 @@ class GimbalRegistry:
 
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
+        # Maps (component id, number) to the gimbal; the number is 0 if the component itself is the gimbal.
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
         # Represents the first gimbal until one is discovered, and receives the values of the first gimbal afterwards.
         # MOUNT_STATUS and MOUNT_ORIENTATION, which have no gimbal id, set only the values of this placeholder.
@@ -201,9 +202,8 @@ class GimbalRegistry:
 
     def _device_with_own_id(self, device_id: int, *, may_be_new: bool) -> GimbalDevice | None:
         # GIMBAL_MANAGER_STATUS may name a device that does not exist; GIMBAL_MANAGER_INFORMATION names existing ones.
-        key = (device_id, 0)
-        if key in self.devices or (may_be_new and device_id in GIMBAL_COMPONENT_IDS):
-            return self._marked_discovered(self.get_or_create(*key))
+        if (device_id, 0) in self.devices or (may_be_new and device_id in GIMBAL_COMPONENT_IDS):
+            return self._marked_discovered(self.get_or_create(device_id, number=0))
         return None
 
     def _on_device_information(self, message: GimbalDeviceInformation) -> None:

@@ -308,10 +308,10 @@ class Gimbals:
         """
         check_range("device_id", device_id, 1, 255)
         device = self._registry.find(device_id)
-        if device is None:
-            is_numbered = device_id <= MAX_GIMBAL_NUMBER
-            key = (self._context.session.component_id, device_id) if is_numbered else (device_id, 0)
-            device = self._registry.get_or_create(*key)
+        if device is None and device_id <= MAX_GIMBAL_NUMBER:  # It is attached to the autopilot.
+            device = self._registry.get_or_create(self._context.session.component_id, number=device_id)
+        elif device is None:
+            device = self._registry.get_or_create(device_id, number=0)
         if device is None:
             raise BusyError(f"there are {MAX_GIMBALS} gimbals already: {', '.join(map(str, self.ids))}")
         return self._gimbal(device)

@@ -210,7 +210,7 @@ class ParameterAccess:
         from aerokit.protocols.parameter_requests import ParameterReads
 
         transfers, store = self._transfers, self.store
-        stale_values = {name: store.stale(name) for name in names}
+        stale_values = {name: store.stale_value(name) for name in names}
         exchange = ParameterReads(
             transfers.system_id,
             transfers.component_id,
