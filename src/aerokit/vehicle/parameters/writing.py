@@ -79,7 +79,13 @@ class NameResolver:
         answers = await self._access.read(self._names_in_doubt(normalized.values()), idle_timeout_s)
         # If the vehicle reboots meanwhile, the store is cleared, and parameters that were known must also be read.
         while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:
-            answers |= await self._access.read(to_read, idle_timeout_s, probe=True)
+            read = await self._access.read(to_read, idle_timeout_s, probe=True)
+            # An error is wrong if the value has arrived right after it, as late answers do in a burst.
+            answers |= {
+                name: answer
+                for name, answer in read.items()
+                if isinstance(answer, Parameter) or name not in self._access.store
+            }
         for requested, name in normalized.items():
             result = self._resolve_one(name, answers)
             if isinstance(result, ResolvedParameter):
