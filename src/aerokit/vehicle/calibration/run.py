@@ -66,7 +66,6 @@ class CalibrationRun:
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
         # Closed when the calibration has ended on the vehicle. Removes callbacks, and stops sending the cancel command.
         self._cleanup = ExitStack()
-        self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
         self._is_abandoned = False
         # True from `abandon` on, until the vehicle has confirmed the cancellation.
@@ -155,11 +154,11 @@ class CalibrationRun:
         # When the pilot or another ground station takes over, the arbiter ends this order, and `_confirm_cancel` stops
         # sending the cancel command.
         order = self._cleanup.enter_context(arbiter.auxiliary_order(ends_with_actions=False))
-        self._cancel_command_status = self._cleanup.enter_context(arbiter.sending(order))
+        sent_command = self._cleanup.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel_command)
         self._is_unconfirmed = True
-        self.session.background.start(self._confirm_cancel, "aerokit calibration")
+        self.session.background.start(lambda: self._confirm_cancel(sent_command), "aerokit calibration")
 
     async def wait_cancelled(self) -> None:
         """Wait until the vehicle has confirmed that the calibration was cancelled.
@@ -183,7 +182,7 @@ class CalibrationRun:
         self.session.commands.forget_result(int(command))
         self.session.commands.send_unconfirmed(int(command), *params)
 
-    async def _confirm_cancel(self) -> None:
+    async def _confirm_cancel(self, sent_command: SentCommand) -> None:
         assert self._cancel_command is not None
         try:
             for attempt in range(MAX_CANCEL_ATTEMPTS):
@@ -194,7 +193,7 @@ class CalibrationRun:
                     if self._has_rebooted:  # The reboot has ended the calibration.
                         self._is_unconfirmed = False
                         return
-                    is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
+                    is_taken_over = bool(sent_command.end)
                     if is_taken_over:  # The command might disturb the pilot or the other ground station.
                         return
                     if not self.context.arbiter.is_state_recent:
