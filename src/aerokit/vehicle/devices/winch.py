@@ -209,11 +209,7 @@ class Winch(ReadOnly):
         params = (self._number, action, length_m, rate_m_s)
         effect = None if is_done is None else Effect("WinchStatus", is_done)
         await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
-            self._context,
-            device_order=order,
-            topic=self._topic,
-            component_id=self._component_id,
-            timeout=timeout,
+            self._context, device_order=order, topic=self._topic, component_id=self._component_id, timeout=timeout
         )
 
     def _check_supported(self, action: WinchActions) -> None:

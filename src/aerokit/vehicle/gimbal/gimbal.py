@@ -331,10 +331,7 @@ class Gimbals:
             # One component may refuse, although others send the message.
             with suppress(CommandRejected, CommandTimeout):
                 await session.commands.send_long(
-                    MavCmd.REQUEST_MESSAGE,
-                    GimbalManagerInformation.ID,
-                    component_id=BROADCAST_COMPONENT,
-                    attempts=2,
+                    MavCmd.REQUEST_MESSAGE, GimbalManagerInformation.ID, component_id=BROADCAST_COMPONENT, attempts=2
                 )
         await anyio.sleep(max(0.0, deadline - session.connection.now()))
         session.end.raise_if_ended()

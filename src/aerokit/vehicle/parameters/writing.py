@@ -76,16 +76,13 @@ class NameResolver:
         """Resolve names, reading parameters that are unknown. Warns of renamed parameters."""
         normalized = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
+        store = self._access.store
         answers = await self._access.read(self._names_in_doubt(normalized.values()), idle_timeout_s)
         # If the vehicle reboots meanwhile, the store is cleared, and parameters that were known must also be read.
         while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:
             read = await self._access.read(to_read, idle_timeout_s, probe=True)
             # An error is wrong if the value has arrived right after it, as late answers do in a burst.
-            answers |= {
-                name: answer
-                for name, answer in read.items()
-                if isinstance(answer, Parameter) or name not in self._access.store
-            }
+            answers |= {name: read[name] for name in read if isinstance(read[name], Parameter) or name not in store}
         for requested, name in normalized.items():
             result = self._resolve_one(name, answers)
             if isinstance(result, ResolvedParameter):
