@@ -224,19 +224,19 @@ class ParameterAccess:
             idle_timeout_s=idle_timeout_s,
         )
         if len(names) > MAX_READS_AT_DEFAULT_RATE:
-            raise_after_s: float | None = 0.0
+            raise_rate_after_s: float | None = 0.0
         elif probe:
-            raise_after_s = RAISE_DELAY_S
+            raise_rate_after_s = RAISE_DELAY_S
         else:
-            raise_after_s = None
-        with self._raised_rate(raise_after_s):
+            raise_rate_after_s = None
+        with self._raised_rate(raise_rate_after_s):
             return await transfers.run(exchange)
 
-    def _read_later(self, name: str, time: float) -> None:
-        """Read a parameter in the background at ``time`` (loop's clock)."""
+    def _read_later(self, name: str, at: float) -> None:
+        """Read a parameter in the background, at a time of the event loop's clock."""
 
         async def read() -> None:
-            await anyio.sleep(time - self._transfers.connection.now())
+            await anyio.sleep(at - self._transfers.connection.now())
             self._read_later_names.discard(name)
             with suppress(AerokitError):
                 # The answer corrects the stored value, which may be wrong.
@@ -312,9 +312,9 @@ class ParameterAccess:
             on_progress=on_progress,
         )
         # A higher rate of answers is worth its cost only for many reads.
-        raise_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
+        raise_rate_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
         try:
-            with self._raised_rate(raise_after_s):
+            with self._raised_rate(raise_rate_after_s):
                 answers = await transfers.run(exchange)
         finally:
             # Recorded after a failed or cancelled write, too, because its answers may arrive late.
