@@ -550,3 +550,14 @@ async def test_late_camera_does_not_replace_known_autopilot_camera(sign: str) ->
         camera.faults.heartbeats_stopped = False
         await anyio.sleep(2.0)
         assert (first.number, flight.vehicle.cameras.value) == (1, (100, 1) if sign == "report" else (100,))
+
+
+async def test_awaited_stop_ends_if_vehicle_block_is_left_at_once() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        link = vehicle.camera._shutter.link
+        stop = asyncio.ensure_future(link.end_operation(link.begin_order("video"), STOP_VIDEO, is_awaited=True))
+        await asyncio.sleep(0)  # The command is sent now, but the task that confirms it has not begun.
+    with pytest.raises(ConnectionClosed, match="block of this vehicle was left"), anyio.fail_after(10):
+        await stop

@@ -263,8 +263,8 @@ async def test_requested_capture_is_dropped_if_series_starts_elsewhere(monkeypat
                 return first
 
             monkeypatch.setattr(captures._log, "fetch", fetch)
-            await captures._fetch_missing()
-        assert captures._waiting == {}
+            await captures._fetch_next()
+        assert captures._received == {}
         assert captures._next_index == 7
 
 

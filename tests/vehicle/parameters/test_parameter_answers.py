@@ -12,6 +12,7 @@ from flight_harness import Flight, open_flight
 from aerokit.errors import OperationTimeout, ParameterRejected, ParameterTimeout
 from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamSet, ParamValue
 from aerokit.parameters import Parameter, ParameterType
+from aerokit.vehicle.parameters.access import ParameterAccess
 from aerokit.vehicle.parameters.writing import outcome_of
 
 pytestmark = pytest.mark.anyio
@@ -88,6 +89,18 @@ async def test_read_times_out_if_only_one_name_is_rejected(grounded: Flight) -> 
     copter.handlers[ParamRequestRead.ID] = reject_new_name
     with pytest.raises(ParameterTimeout):
         await grounded.vehicle.parameters.get("WP_SPD", idle_timeout_s=2)
+
+
+async def test_value_right_after_rejection_is_used(grounded: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After an outage, the answers to many requests arrive in a burst, the last of them after the rejection."""
+    read = ParameterAccess.read
+
+    async def read_too_late(access: ParameterAccess, names: Any, *args: Any, probe: bool = False) -> Any:
+        answers = await read(access, names, *args, probe=probe)
+        return {name: ParameterRejected("not answered", name=name) for name in names} if probe else answers
+
+    monkeypatch.setattr(ParameterAccess, "read", read_too_late)
+    assert await grounded.vehicle.parameters.get("LAND_SPEED") == grounded.copter.parameters["LAND_SPEED"]
 
 
 async def test_ardupilot_names_are_sent_in_upper_case(grounded: Flight) -> None:

@@ -54,9 +54,9 @@ class Calibration(AsyncIterator["CalibrationStep"]):
         # The event loop of the iteration; None before the first step.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_over = False
-        # `_lock` is held while a task waits for the next step. `_waiting` is the scope in which that task waits.
+        # `_lock` is held while a task waits for the next step. `_wait_scope` is the scope in which that task waits.
         self._lock = asyncio.Lock()
-        self._waiting: anyio.CancelScope | None = None
+        self._wait_scope: anyio.CancelScope | None = None
 
     def __aiter__(self) -> Calibration:
         return self
@@ -67,7 +67,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
         self._loop = asyncio.get_running_loop()  # `__del__` needs it, and may run on another thread.
         try:
             async with self._lock:
-                with anyio.CancelScope() as self._waiting:
+                with anyio.CancelScope() as self._wait_scope:
                     return await self._steps.__anext__()
         except BaseException:  # No step follows. `abandon` does nothing if the calibration has ended on the vehicle.
             self._is_over = True
@@ -86,9 +86,9 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             OperationTimeout: the vehicle did not confirm the end.
         """
         self._is_over = True
-        if self._waiting is not None:
-            self._waiting.cancel()
-        async with self._lock:
+        if self._wait_scope is not None:
+            self._wait_scope.cancel()
+        async with self._lock:  # The task that was waiting has left the generator.
             await self._steps.aclose()
         if self._run.is_running:
             self._run.abandon()

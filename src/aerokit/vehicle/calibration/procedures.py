@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections import deque
 from contextlib import ExitStack, suppress
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.calibration.values import CalibrationReport, CalibrationStep
 
 CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
+ALL_COMPASSES = 0  # as a bit mask
 REPORT_HZ = 4.0
 # Value of ESC_CALIBRATION with which ArduCopter calibrates the ESCs at its next boot.
 CALIBRATE_AT_BOOT = 3
@@ -53,7 +55,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     reports: deque[CalibrationReport] = deque()
     # When the vehicle was last seen in the state CALIBRATING. Infinite before the first time, so that
     # `has_ended_silently` returns False.
-    calibrating_at = math.inf
+    last_calibrating_at = math.inf
     with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:
@@ -63,11 +65,11 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
         # With `every_arrival`, a text that equals the previous one is also a report.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
-        def has_ended_silently() -> bool:
-            nonlocal calibrating_at
+        def has_ended_silently() -> bool:  # `run.wait` calls it repeatedly, so it sees every state.
+            nonlocal last_calibrating_at
             if telemetry.system_status.latest == MavState.CALIBRATING:
-                calibrating_at = now()
-            return now() - calibrating_at > END_GRACE_S
+                last_calibrating_at = now()
+            return now() - last_calibrating_at > END_GRACE_S
 
         await run.start(*params)
         step = run.new_step(0.0, "keep the vehicle still")
@@ -169,14 +171,14 @@ async def _read_parameter(run: CalibrationRun, name: str) -> float:
 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
+    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, ALL_COMPASSES))
     percents: dict[int, int] = {}  # progress in percent by number of the compass
     reports: dict[int, MagCalReport] = {}  # final report by number of the compass
-    has_changed = False
+    has_news = asyncio.Event()  # set when a report or another progress has arrived
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
     def on_message(message: MagCalProgress | MagCalReport) -> None:
-        nonlocal compass_mask, has_changed
+        nonlocal compass_mask
         if not run.is_from_autopilot(message):
             return
         compass_mask |= message.cal_mask
@@ -186,18 +188,15 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             return  # The same progress again is not a change.
         else:
             percents[message.compass_id] = message.completion_pct
-        has_changed = True
-
-    def has_news() -> bool:
-        return has_changed
+        has_news.set()
 
     def is_complete() -> bool:
         compasses = [number for number in range(8) if compass_mask >> number & 1]
         return bool(compasses) and all(number in reports for number in compasses)
 
     with ExitStack() as cleanup:
-        # The mask 0 means all compasses. The other zeros mean no retry, no automatic saving, no delay and no reboot.
-        await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
+        retry = autosave = delay_s = autoreboot = 0
+        await run.start(ALL_COMPASSES, retry, autosave, delay_s, autoreboot, command=MavCmd.DO_START_MAG_CAL)
         session = run.session
         for message_type in (MagCalProgress, MagCalReport):
             cleanup.callback(session.connection.bus.attach(message_type, on_message, system_id=session.system_id))
@@ -205,8 +204,8 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         instruction = "turn the vehicle slowly in all directions, about each of its axes"
         yield run.new_step(0.0, instruction)
         while not is_complete():
-            await run.wait(has_news, timeout_text="no compass reported progress")
-            has_changed = False
+            await run.wait(has_news.is_set, timeout_text="no compass reported progress")
+            has_news.clear()
             progress = min(percents.values(), default=0) / 100
             yield run.new_step(progress, instruction)
     failures = [
@@ -216,7 +215,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     ]
     if failures:
         raise run.failure(f"{'; '.join(failures)}; the previous calibration is kept")
-    await run.command(MavCmd.DO_ACCEPT_MAG_CAL, 0)
+    await run.command(MavCmd.DO_ACCEPT_MAG_CAL, ALL_COMPASSES)
     fits = tuple(
         CompassFit(report.compass_id, report.fitness, (report.ofs_x, report.ofs_y, report.ofs_z))
         for _, report in sorted(reports.items())
@@ -276,9 +275,9 @@ MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
 CHANNELS_TIMEOUT_S = 5.0
 # RCn_MIN must be between the first two values, RCn_MAX between the last two (RC_Channel.cpp, PX4 rc_params).
 LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
-# After PREFLIGHT_CALIBRATION with param4 = 1, ArduPilot refuses to arm until it receives one with param4 = 0. ArduPilot
-# executes both, but answers UNSUPPORTED (GCS_Common.cpp, _handle_command_preflight_calibration).
-RESULTS_OF_RC_COMMAND = (MavResult.UNSUPPORTED,)
+# ArduPilot executes the commands that begin and end the calibration of the radio, but answers UNSUPPORTED
+# (GCS_Common.cpp, _handle_command_preflight_calibration).
+RADIO_COMMAND_RESULTS = (MavResult.UNSUPPORTED,)
 
 
 async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
@@ -301,7 +300,8 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         if not _pulses(channels.latest):
             raise run.failure("the receiver reports no channels; switch the transmitter on; nothing was sent")
         await run.begin(CANCEL_ALL)
-        await run.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 1, accepts=RESULTS_OF_RC_COMMAND)
+        # With param4 = 1, ArduPilot refuses to arm until it receives the command with param4 = 0 (CANCEL_ALL).
+        await run.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 1, accepts=RADIO_COMMAND_RESULTS)
 
         def on_channels(value: object) -> None:
             for number, pulse in _pulses(value).items():
@@ -321,10 +321,19 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     moved = [number for number in lows if highs[number] - lows[number] >= MIN_TRAVEL_US]
     if len(moved) < MIN_CHANNELS:
         raise run.failure(f"only {len(moved)} channels moved by {MIN_TRAVEL_US} µs or more; nothing was written")
+    # A missing trim counts as 0, which `_radio_parameters` refuses.
+    ranges = {number: (lows[number], trims.get(number, 0), highs[number]) for number in moved}
+    values = _radio_parameters(run, ranges)
+    async with run.parameters().transaction() as transaction:
+        await transaction.set_many(values)
+    await run.command(*CANCEL_ALL, accepts=RADIO_COMMAND_RESULTS)
+    yield run.result(f"{len(moved)} channels were calibrated")
+
+
+def _radio_parameters(run: CalibrationRun, ranges: dict[int, tuple[int, int, int]]) -> dict[str, float]:
+    """Check the lowest, center and highest pulse of each channel, and return them as parameters."""
     values: dict[str, float] = {}
-    for number in moved:
-        # A missing trim counts as 0, which fails the next check.
-        low, high, trim = lows[number], highs[number], trims.get(number, 0)
+    for number, (low, trim, high) in ranges.items():
         if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
             raise run.failure(
                 f"channel {number} ranges from {low} to {high} µs with a center of {trim} µs; its minimum must be from"
@@ -332,10 +341,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
                 " between them; nothing was written"
             )
         values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}
-    async with run.parameters().transaction() as transaction:
-        await transaction.set_many(values)
-    await run.command(*CANCEL_ALL, accepts=RESULTS_OF_RC_COMMAND)
-    yield run.result(f"{len(moved)} channels were calibrated")
+    return values
 
 
 def _pulses(value: object) -> dict[int, int]:

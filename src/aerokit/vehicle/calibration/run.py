@@ -66,7 +66,6 @@ class CalibrationRun:
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
         # Closed when the calibration has ended on the vehicle. Removes callbacks, and stops sending the cancel command.
         self._cleanup = ExitStack()
-        self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
         self._is_abandoned = False
         # True from `abandon` on, until the vehicle has confirmed the cancellation.
@@ -155,11 +154,11 @@ class CalibrationRun:
         # When the pilot or another ground station takes over, the arbiter ends this order, and `_confirm_cancel` stops
         # sending the cancel command.
         order = self._cleanup.enter_context(arbiter.auxiliary_order(ends_with_actions=False))
-        self._cancel_command_status = self._cleanup.enter_context(arbiter.sending(order))
+        sent_command = self._cleanup.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel_command)
         self._is_unconfirmed = True
-        self.session.background.start(self._confirm_cancel, "aerokit calibration")
+        self.session.background.start(lambda: self._confirm_cancel(sent_command), "aerokit calibration")
 
     async def wait_cancelled(self) -> None:
         """Wait until the vehicle has confirmed that the calibration was cancelled.
@@ -183,27 +182,25 @@ class CalibrationRun:
         self.session.commands.forget_result(int(command))
         self.session.commands.send_unconfirmed(int(command), *params)
 
-    async def _confirm_cancel(self) -> None:
+    async def _confirm_cancel(self, sent_command: SentCommand) -> None:
         assert self._cancel_command is not None
-        command = self._cancel_command[0]
-        must_send = self._cancel_sent_at is None  # `abandon` has sent the first command, unless the vehicle was silent.
         try:
-            for _ in range(MAX_CANCEL_ATTEMPTS):
-                if must_send:
+            for attempt in range(MAX_CANCEL_ATTEMPTS):
+                was_sent_by_abandon = attempt == 0 and self._cancel_sent_at is not None
+                if not was_sent_by_abandon:
                     # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                     await self.session.wait_for_heartbeat(self._cancel_sent_at)
                     if self._has_rebooted:  # The reboot has ended the calibration.
                         self._is_unconfirmed = False
                         return
-                    is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
+                    is_taken_over = bool(sent_command.end)
                     if is_taken_over:  # The command might disturb the pilot or the other ground station.
                         return
                     if not self.context.arbiter.is_state_recent:
                         continue
                     self._send_cancel(*self._cancel_command)
-                must_send = True
                 with anyio.move_on_after(CANCEL_INTERVAL_S):
-                    while not self._is_cancelled(command):  # noqa: ASYNC110
+                    while not self._is_cancel_confirmed():  # noqa: ASYNC110
                         await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
                     self._is_unconfirmed = False
                     return
@@ -213,16 +210,18 @@ class CalibrationRun:
         finally:
             self.finish()
 
-    def _is_cancelled(self, cancel_command: float) -> bool:
+    def _is_cancel_confirmed(self) -> bool:
         if self._has_rebooted:
             return True
+        assert self._cancel_command is not None
         assert self._cancel_sent_at is not None
-        if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
-            return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
+        command = int(self._cancel_command[0])
+        if command != MavCmd.PREFLIGHT_CALIBRATION:
+            return self.session.commands.accepted_at(command) >= self._cancel_sent_at
         # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if self.session.autopilot.calibration_protocol != "texts":
             # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp). So any answer is a confirmation.
-            return self.session.commands.last_result(int(cancel_command)) is not None
+            return self.session.commands.last_result(command) is not None
         # PX4 acknowledges PREFLIGHT_CALIBRATION twice, with different results, so its HEARTBEAT is the confirmation.
         status = self.session.telemetry.system_status
         return status.updated_at > self._cancel_sent_at and status.latest != MavState.CALIBRATING

@@ -246,11 +246,11 @@ class Cameras:
     def _on_heartbeat(self, heartbeat: m.Heartbeat) -> None:
         frame = heartbeat.received_frame
         if frame is not None and (heartbeat.type == MavType.CAMERA or frame.component_id in CAMERA_COMPONENT_IDS):
-            self._record(heartbeat, frame.component_id)
+            self._register_sender(heartbeat, frame.component_id)
 
     def _on_information(self, message: m.CameraInformation) -> None:
         # ArduPilot does not set camera_device_id but lens_id, which is 0 for its first camera (AP_Camera_Backend.cpp).
-        self._record(message, message.camera_device_id or message.lens_id + 1)
+        self._register_sender(message, message.camera_device_id or message.lens_id + 1)
 
     def _on_first_bound(self, number: int) -> None:
         # `at` may have created another object for the same camera. The first link is then muted, so that events are
@@ -258,10 +258,9 @@ class Cameras:
         self._first_link.is_muted = number in self._cameras
 
     def _on_capture(self, message: Any, device_id: int) -> None:
-        number = self._record(message, device_id)
-        is_camera = number != 0
+        number = self._register_sender(message, device_id)
         has_object = number == self._first_link.number or number in self._cameras
-        if not is_camera or has_object:  # The object of a known camera receives this message by itself.
+        if number is None or has_object:  # The object of a known camera receives this message by itself.
             return
         capture = capture_of(message, number, self._session.connection.now(), self._session.telemetry)
         if self._first_link.number is None:
@@ -281,17 +280,17 @@ class Cameras:
         for message, capture in captures:
             self.at(capture.camera)._log.record(message, capture)
 
-    def _record(self, message: Any, device_id: int) -> int:
-        """Add the camera to `cell` and return its number. Returns 0 if the message is not from a camera."""
+    def _register_sender(self, message: Any, device_id: int) -> int | None:
+        """Add the camera that sent a message to `cell` and return its number, or None if the sender is no camera."""
         frame = message.received_frame
         if frame is None:
-            return 0
+            return None
         is_from_autopilot = frame.component_id == self._session.component_id
-        number = device_id if is_from_autopilot else frame.component_id
+        number: int = device_id if is_from_autopilot else frame.component_id
         # Cameras of the autopilot have the numbers 1 to 6; all other cameras have their component ids.
         has_autopilot_number = number in AUTOPILOT_CAMERA_IDS
         if has_autopilot_number != is_from_autopilot or number == 0:
-            return 0
+            return None
         numbers = self.cell.latest or ()
         if number not in numbers:
             source = Source(self._session.system_id, frame.component_id, message.NAME)
@@ -299,7 +298,7 @@ class Cameras:
         # A camera with its own component id becomes `first`, unless another camera is known to be the first.
         if not has_autopilot_number:
             self._first_link.bind(number)
-        return int(number)
+        return number
 
 
 def _sort_key(number: int) -> tuple[bool, int]:

@@ -12,12 +12,7 @@ from aerokit.errors import CommandRejected
 from aerokit.events import ImageCaptured
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavResult
-from aerokit.vehicle.camera.capture import (
-    FEEDBACK_INDEX_RANGE,
-    UNIX_TIME_OF_1990_S,
-    Capture,
-    capture_of,
-)
+from aerokit.vehicle.camera.capture import FEEDBACK_INDEX_RANGE, UNIX_TIME_OF_1990_S, Capture, capture_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -128,7 +123,7 @@ class CaptureLog:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None  # PX4's trigger cannot send a capture again.
-        self._requested.append(index)  # A low index in the answer does not mean that the camera counts from 0 again.
+        self._requested.append(index)  # `_shows_reset` does not take the low index of the answer for a reset.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index):
@@ -177,7 +172,8 @@ class CaptureLog:
             # Before the first picture, ArduPilot sends a message of zeros, which is not a capture. An index of 0
             # belongs to a picture only if the indices may have returned to 0.
             may_have_wrapped = self._highest is not None and self._highest.capture.index > HALF_RANGE
-            if (message.img_idx > 0 or may_have_wrapped) and message.cam_idx + 1 == self._link.number:
+            is_capture = message.img_idx > 0 or may_have_wrapped
+            if is_capture and message.cam_idx + 1 == self._link.number:
                 self._add(message, capture)
         elif isinstance(message, m.CameraTrigger) and self._link.is_autopilot_attached and not self._has_images:
             self._link.call_later(TRIGGER_GRACE_S, lambda: self._add_unless_reported(message, capture))

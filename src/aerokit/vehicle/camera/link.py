@@ -74,7 +74,7 @@ class CameraLink(CameraOrders):
         # Called when the camera's log of captures was cleared.
         self.on_cleared: list[Callable[[], None]] = []
         self._identify_lock = anyio.Lock()
-        self._is_found = anyio.Event()
+        self._is_number_confirmed = anyio.Event()
         self._heartbeat_at = -math.inf
         # True if an identified camera was silent and must identify itself again: another camera may now use its id.
         self._must_identify_again = False
@@ -128,26 +128,30 @@ class CameraLink(CameraOrders):
         return f"camera {self.number}{f' ({model})' if model else ''}"
 
     def bind(self, number: int, *, is_guess: bool = False) -> None:
-        """Address this camera from now on. Later calls do nothing, unless this number is a guess without orders."""
-        has_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
-        if self._is_found.is_set() or has_orders:
+        """Use the camera with this number. A guess is replaced by a later call, unless it has been given orders."""
+        # Orders that were given to the guessed camera must not be repeated to another one.
+        has_given_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
+        if self._is_number_confirmed.is_set() or has_given_orders:
             return
         if not is_guess:
-            self._is_found.set()
-        if number == self.number:
-            return
+            self._is_number_confirmed.set()
+        if number != self.number:  # Otherwise the guess was right.
+            self._change_number(number)
+
+    def _change_number(self, number: int) -> None:
         self.number = number
         self._on_bound(number)
         component_id = self._session.component_id if number in AUTOPILOT_CAMERA_IDS else number
         self._component = self._component_of(component_id)
         self._heartbeat_at = self._session.connection.last_heartbeat_at(self._session.system_id, component_id)
+        # What is known so far is about the camera that was guessed.
         self._forget_refusals()
-        for cell in self._cells:  # A value may be from the autopilot, such as PX4's own storage.
+        for cell in self._cells:
             cell.forget()
         for detach in self._detach_listeners:
             detach()
         for message_type, callback in self._listeners:
-            self._attach(message_type, callback)
+            self._attach_listener(message_type, callback)
 
     def start_polling(self) -> None:
         """Start polling state values in the background. Call it on the event loop's thread."""
@@ -165,9 +169,9 @@ class CameraLink(CameraOrders):
                 if self.number is None:
                     await self._find_first_camera()
                 # Another call may have received the information while this call waited for the lock.
-                asked: int | None = None
-                while self._needs_information() and not self.is_trigger and self.number != asked:
-                    asked = self.number  # During the request, another camera may take the place of a guess.
+                asked_number: int | None = None
+                while self._needs_information() and not self.is_trigger and self.number != asked_number:
+                    asked_number = self.number  # During the request, another camera may take the place of a guess.
                     await self._request_information()
         return self.information.latest
 
@@ -179,7 +183,7 @@ class CameraLink(CameraOrders):
         # wait for the heartbeat of such a camera.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
-            await self._is_found.wait()
+            await self._is_number_confirmed.wait()
         if self.number is None:  # Until a camera sends a message, assume that one is attached to the autopilot.
             self.bind(AUTOPILOT_CAMERA_IDS[0], is_guess=True)
 
@@ -254,9 +258,9 @@ class CameraLink(CameraOrders):
         """Call ``callback`` with this camera's messages of one type, as soon as the camera is bound."""
         self._listeners.append((message_type, callback))
         if self._component is not None:
-            self._attach(message_type, callback)
+            self._attach_listener(message_type, callback)
 
-    def _attach(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
+    def _attach_listener(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
         bus, component_id = self._session.connection.bus, self.component.component_id
 
         def on_message(message: Any) -> None:
@@ -264,7 +268,7 @@ class CameraLink(CameraOrders):
             if frame is not None and frame.component_id == component_id and self._is_from_this_camera(message):
                 # An autopilot without a camera also sends HEARTBEAT, and PX4 STORAGE_INFORMATION about its own card.
                 if message_type.NAME.startswith("CAMERA_"):
-                    self._is_found.set()
+                    self._is_number_confirmed.set()
                 callback(message)
 
         if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
@@ -332,10 +336,11 @@ class ActiveOperation:
         try:
             yield
         except BaseException as error:
-            if not self.order.was_sent or isinstance(error, CommandRejected):
+            cannot_have_started = not self.order.was_sent or isinstance(error, CommandRejected)
+            if cannot_have_started:
                 self.order.withdraw()
                 self.discard()
-            else:  # The camera may have started nevertheless.
+            else:
                 self.order.commit()
                 # Do not wait for the answer to the stop command, so that the error is raised without delay.
                 await self.stop(is_awaited=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 from contextlib import suppress
@@ -73,8 +74,8 @@ class CameraOrders:
 
     # Topics of the orders given by this object.
     _ordered_topics: set[Topic]
-    # Set once `number` is known to be right. Before that, `number` is None, or a guess.
-    _is_found: anyio.Event
+    # Set once `number` is known to be right. Before that, it is None or a guess.
+    _is_number_confirmed: anyio.Event
 
     @property
     def is_autopilot_attached(self) -> bool:
@@ -162,7 +163,7 @@ class CameraOrders:
                     attempts=attempts,
                     **options,
                 )
-                self._is_found.set()  # A camera that accepts orders is there, so no other camera takes its place.
+                self._is_number_confirmed.set()  # A camera that accepts a command exists.
             except CommandRejected as error:
                 # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
@@ -172,11 +173,11 @@ class CameraOrders:
         self,
         order: Order,
         send: Callable[[], Awaitable[None]],
-        had_effect: Callable[[], Awaitable[bool | None]],
+        check_effect: Callable[[], Awaitable[bool | None]],
     ) -> None:
         """Send an order. It is sent again only if the camera reports that it had no effect.
 
-        ``had_effect`` asks the camera, and returns None if there is no answer. A newer order ends the retries.
+        ``check_effect`` asks the camera, and returns None if there is no answer. A newer order ends the retries.
         """
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
@@ -184,18 +185,18 @@ class CameraOrders:
                 return
             except CommandRejected:
                 # A repetition may be refused because the camera is executing an earlier transmission.
-                if attempt == 1 or not await had_effect():
-                    raise
-                return
+                if attempt > 1 and await check_effect():
+                    return
+                raise
             except CommandTimeout as error:
                 error.was_sent = error.was_sent or attempt > 1
-                is_executed = await had_effect() if order.is_newest else None
+                had_effect = await check_effect() if order.is_newest else None
                 if not order.is_newest:  # A newer order may have been given while the camera was asked.
                     error.args = (f"{error}; not sent again: {SUPERSEDED}",)
                     raise
-                if is_executed:
+                if had_effect:
                     return
-                if is_executed is None or attempt == MAX_ORDER_ATTEMPTS:
+                if had_effect is None or attempt == MAX_ORDER_ATTEMPTS:
                     raise
 
     def send_now(self, command: int, *params: float) -> None:
@@ -213,30 +214,27 @@ class CameraOrders:
         if not order.is_newest or self._session.is_closed:
             return
         self.send_now(command, *params)
-        answered = anyio.Event()
-        errors: list[AerokitError] = []
+        failure: AerokitError | None = None
 
         async def confirm() -> None:
+            nonlocal failure
             try:
                 await self._confirm_stop(order, command, *params, is_awaited=is_awaited)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:
-                    errors.append(error)
+                    failure = error
                     if not is_awaited:
                         logger.warning("camera %s may not have stopped: %s", self.number, error)
-            except BaseException:
-                errors.append(ConnectionClosed("the async with block of this vehicle was left"))
-                raise
-            finally:
-                answered.set()
 
-        self._session.background.start(confirm, "aerokit end of a camera's block")
-        if not is_awaited:
+        task = self._session.background.start(confirm, "aerokit end of a camera's block")
+        if task is None or not is_awaited:
             return
-        await answered.wait()
-        if errors:
-            raise errors[0]
+        await asyncio.wait((task,))  # The task continues if this call is cancelled.
+        if task.cancelled():
+            raise ConnectionClosed("the async with block of this vehicle was left")
+        if failure is not None:
+            raise failure
 
     async def _confirm_stop(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
         """Wait for the acknowledgement of a stop command that was just sent, and repeat the command if necessary."""
@@ -345,22 +343,21 @@ class MessageRequests:
 
         Raises CommandRejected if the camera does not support the message.
         """
-        refusal: CommandRejected | None = None
-        if message_type not in self._legacy_types:
-            try:
-                return await self._link.component.request(message_type, *params, where=where, timeout=timeout)
-            except OperationTimeout:
-                return None
-            except CommandRejected as error:
-                has_legacy_request = message_type in LEGACY_REQUESTS and not self._link.is_autopilot_attached
-                if not has_legacy_request or error.result not in MAYBE_UNSUPPORTED:
-                    raise
-                refusal = error
+        if message_type in self._legacy_types:
+            return await self._request_legacy(message_type, params, where, timeout)
+        try:
+            return await self._link.component.request(message_type, *params, where=where, timeout=timeout)
+        except OperationTimeout:
+            return None
+        except CommandRejected as error:
+            has_legacy_request = message_type in LEGACY_REQUESTS and not self._link.is_autopilot_attached
+            if not has_legacy_request or error.result not in MAYBE_UNSUPPORTED:
+                raise
+            refusal = error
         try:
             answer = await self._request_legacy(message_type, params, where, timeout)
-        except CommandRejected as error:
-            # If both requests were refused, the refusal of the standard request is raised.
-            raise refusal or error from None
+        except CommandRejected:  # The camera supports neither request.
+            raise refusal from None
         if answer is not None:
             self._legacy_types.add(message_type)
         return answer

@@ -61,8 +61,12 @@ class Shutter:
         # The answer decides whether an order may be sent again, so the request is repeated. A camera that has never
         # sent its status may not support the message, so it gets fewer requests: FIRST_STATUS_ATTEMPTS for the first
         # order, and only one for later orders.
-        attempts_before_first = 1 if self._ignored_requests else FIRST_STATUS_ATTEMPTS
-        attempts = STATUS_ATTEMPTS if self._reports_status else attempts_before_first
+        if self._reports_status:
+            attempts = STATUS_ATTEMPTS
+        elif not self._ignored_requests:
+            attempts = FIRST_STATUS_ATTEMPTS
+        else:
+            attempts = 1
         for _ in range(attempts):
             status = await self.request_status(STATUS_TIMEOUT_S)
             if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
@@ -72,46 +76,49 @@ class Shutter:
 
     async def take_photo(self, timeout: float) -> Capture:
         async with self._lock:
-            series = self.link.latest_order("series")
-            before = await self.request_status_reliably()
-            known_indices = {capture.index for capture in self.log.captures()}
+            series_before = self.link.latest_order("series")
+            status_before = await self.request_status_reliably()
+            old_indices = {capture.index for capture in self.log.captures()}
             # The error to raise at the time-out; None once the last order is acknowledged. It is set here, because the
             # time may expire while the first order waits for its acknowledgement.
-            error: CommandTimeout | None = CommandTimeout(
+            unacknowledged: CommandTimeout | None = CommandTimeout(
                 f"{self.link.describe()} did not acknowledge the order for a picture within {timeout:g} s;"
                 " it may have taken one"
             )
             with CaptureQueue(self.log) as new_captures, anyio.move_on_after(timeout):
                 attempts = 1
-                error = await self.order_photo(before)
+                unacknowledged = await self.order_photo(status_before)
                 while True:
                     while capture := new_captures.pop():
-                        if _is_new(capture, before, known_indices):
-                            return self._checked(capture)
+                        if _is_new(capture, status_before, old_indices):
+                            return self._successful(capture)
                     round_trip_s = self.link.round_trip_s or 0.0
                     has_arrived = await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s))
                     if has_arrived:
                         continue
+                    # The report may have been lost, so ask the camera whether it has taken a picture.
                     status = await self.request_status()
                     if status is None:
                         continue
-                    missed = await self._fetch_missed(before, status, known_indices, is_accepted=error is None)
+                    is_accepted = unacknowledged is None
+                    missed = await self._fetch_missed(status_before, status, old_indices, is_accepted=is_accepted)
                     if missed is not None:
-                        return self._checked(missed)
+                        return self._successful(missed)
                     # If a series was started or stopped meanwhile, the image count does not show whether the ordered
                     # picture was taken.
-                    is_series_unchanged = self.link.latest_order("series") is series
-                    was_lost = error is not None and is_series_unchanged and _has_taken_none(before, status)
+                    is_series_unchanged = self.link.latest_order("series") is series_before
+                    was_lost = not is_accepted and is_series_unchanged and _has_taken_none(status_before, status)
                     if was_lost and attempts < MAX_ORDER_ATTEMPTS:
                         attempts += 1
-                        error = await self.order_photo(before, is_repeated=True)
-            raise error or self.link.timeout_error(
+                        unacknowledged = await self.order_photo(status_before, is_repeated=True)
+            raise unacknowledged or self.link.timeout_error(
                 f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
             )
 
     async def _fetch_missed(
-        self, before: CameraStatus | None, status: CameraStatus, known_indices: set[int], *, is_accepted: bool
+        self, before: CameraStatus | None, status: CameraStatus, old_indices: set[int], *, is_accepted: bool
     ) -> Capture | None:
+        """Request the capture of the ordered picture, if the status shows that the picture was taken."""
         if before is not None:
             was_taken = status.image_count > before.image_count
             new_index = before.image_count  # Indices begin at 0.
@@ -119,11 +126,11 @@ class Shutter:
         # Without a status from before the order, the newest picture counts as the ordered one if the camera accepted
         # the order.
         newest = status.image_count - 1
-        if is_accepted and not status.is_capturing and newest >= 0 and newest not in known_indices:
+        if is_accepted and not status.is_capturing and newest >= 0 and newest not in old_indices:
             return await self.log.fetch(newest)
         return None
 
-    def _checked(self, capture: Capture) -> Capture:
+    def _successful(self, capture: Capture) -> Capture:
         if capture.success is False:
             raise OperationRejected(f"{self.link.describe()} could not take the picture")
         return capture
@@ -156,18 +163,18 @@ class Shutter:
                 raise
             try:
                 await self._send_digicam_control()
-            except CommandRejected:
+            except CommandRejected:  # The camera supports neither command.
                 raise error from None
 
     async def _send_digicam_control(self) -> None:
         unchanged, take_photo = (0, 0, 0, 0), 1  # session, zoom and focus in param1 to param4, the shutter in param5
-        await self.link.command(MavCmd.DO_DIGICAM_CONTROL, *unchanged, take_photo, 0, 0, attempts=1)
+        await self.link.command(MavCmd.DO_DIGICAM_CONTROL, *unchanged, take_photo, attempts=1)
 
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
         if self.link.is_trigger:
-            interval_ms, shutter_time, enable = seconds * 1000.0, UNCHANGED, 1
+            interval_ms, shutter_time, enable, sequence = seconds * 1000.0, UNCHANGED, 1, UNCHANGED
             await self.link.command(TRIGGER_INTERVAL, interval_ms, shutter_time)
-            await self.link.command(TRIGGER, enable, UNCHANGED, 0, 0, order=order)
+            await self.link.command(TRIGGER, enable, sequence, order=order)
             return
 
         async def has_started() -> bool | None:
@@ -176,20 +183,22 @@ class Shutter:
                 return None  # Without both reports, the number of pictures cannot be compared.
             return status.is_in_series or status.is_capturing or status.image_count > before.image_count
 
-        command = (START, self.link.device_id, seconds, count, 0)
-        await self.link.order_once(order, lambda: self.link.command(*command, order=order, attempts=1), has_started)
+        params = (self.link.device_id, seconds, count)
+        await self.link.order_once(
+            order, lambda: self.link.command(START, *params, order=order, attempts=1), check_effect=has_started
+        )
 
     @property
     def stop_command(self) -> tuple[float, ...]:
-        return (TRIGGER, 0, UNCHANGED, 0, 0) if self.link.is_trigger else (STOP, self.link.device_id)
+        return (TRIGGER, 0, UNCHANGED) if self.link.is_trigger else (STOP, self.link.device_id)
 
 
-def _is_new(capture: Capture, before: CameraStatus | None, known_indices: set[int]) -> bool:
+def _is_new(capture: Capture, before: CameraStatus | None, old_indices: set[int]) -> bool:
     """Return True if the picture may have been ordered after the status ``before``."""
     # A low index usually means an older picture. If no older capture has this index, the picture may be new, because a
     # camera may use the index of a failed picture again.
     is_low = before is not None and capture.index < before.image_count
-    return not is_low or capture.index not in known_indices
+    return not is_low or capture.index not in old_indices
 
 
 def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
@@ -221,10 +230,9 @@ class PhotoInterval:
         # The highest plausible index so far, and when it was received.
         self._newest_index = 0
         self._newest_at = 0.0
-        # Number of successive requests that the camera did not answer.
-        self._unanswered = 0
+        self._unanswered_requests = 0  # in succession
         # Received captures that were not delivered yet: the successful ones by index, and the failed ones.
-        self._waiting: dict[int, Capture] = {}
+        self._received: dict[int, Capture] = {}
         self._failed: list[Capture] = []
         # How many captures the iterator has returned, and how many could not be received.
         self._delivered = 0
@@ -280,18 +288,18 @@ class PhotoInterval:
         while True:
             if self._count and self._delivered + self._missed >= self._count:
                 raise StopAsyncIteration
-            self._collect()
+            self._process_new_captures()
             if self._failed:
                 self._delivered += 1
                 return self._failed.pop(0)
-            if self._next_index is not None and self._next_index in self._waiting:
-                capture = self._waiting.pop(self._next_index)
-                self._unanswered = 0
+            if self._next_index is not None and self._next_index in self._received:
+                capture = self._received.pop(self._next_index)
+                self._unanswered_requests = 0
                 self._next_index += 1
                 self._delivered += 1
                 return capture
-            if self._waiting and self._next_index is not None:
-                await self._fetch_missing()
+            if self._received and self._next_index is not None:  # Later captures have arrived, but not the next one.
+                await self._fetch_next()
                 continue
             patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # A picture may be late.
             has_arrived = await self._new_captures.wait(patience_s)
@@ -304,18 +312,15 @@ class PhotoInterval:
     def _first_after_reset(self, capture: Capture) -> Capture | None:
         """Return the previous capture if it was the first after the camera began to count from 0 again."""
         previous, self._possible_first = self._possible_first, None
-        if (
-            self._log.reset_at > self._known_reset_at
-            and self._next_index is not None
-            and capture.index < self._next_index
-        ):
+        has_log_reset = self._log.reset_at > self._known_reset_at
+        if has_log_reset and self._next_index is not None and capture.index < self._next_index:
             self._possible_first = capture
             # A single low index could be corrupt, so two successive ones are needed.
             if previous is not None and capture.index == previous.index + 1:
                 return previous
         return None
 
-    def _collect(self) -> None:
+    def _process_new_captures(self) -> None:
         while capture := self._new_captures.pop():
             first = self._first_after_reset(capture)
             if first is not None:
@@ -333,12 +338,12 @@ class PhotoInterval:
         self._next_index = first.index
         self._is_start_guessed = False
         self._set_newest(first.index)
-        self._waiting = {first.index: first}
+        self._received = {first.index: first}
 
     def _guess_start(self, index: int) -> None:
         self._is_start_guessed = self._next_index is None  # False once the guess was corrected.
         self._next_index = index
-        self._waiting.clear()  # It may contain the capture with the corrupt index.
+        self._received.clear()  # It may contain the capture with the corrupt index.
         self._newest_index = index - 1  # One less, so that `_add` accepts the capture as the newest one.
 
     def _add(self, capture: Capture) -> None:
@@ -346,7 +351,7 @@ class PhotoInterval:
         if capture.success is False:
             self._failed.append(capture)
         elif self._next_index is not None and capture.index >= self._next_index:
-            self._waiting[capture.index] = capture
+            self._received[capture.index] = capture
             if capture.index > self._newest_index:
                 if self._delivered:  # A second capture with a higher index confirms the guess.
                     self._is_start_guessed = False
@@ -369,28 +374,28 @@ class PhotoInterval:
             and index < self._next_index - self._max_new_captures()
         )
 
-    async def _fetch_missing(self) -> None:
+    async def _fetch_next(self) -> None:
         """Request the next capture. If it does not arrive, it counts as missed."""
         index = self._next_index
         assert index is not None
         capture = None
-        can_fetch = not self._link.is_trigger and self._unanswered < MAX_UNANSWERED
+        can_fetch = not self._link.is_trigger and self._unanswered_requests < MAX_UNANSWERED
         if can_fetch:
             capture = await self._log.fetch(index)
-        self._collect()
+        self._process_new_captures()
         if self._next_index != index:  # The captures that have arrived meanwhile show another start of the series.
             return
         if capture is not None:
-            self._unanswered = 0
-            if capture.success is False:  # `_collect` has added it to `_failed`.
+            self._unanswered_requests = 0
+            if capture.success is False:  # `_process_new_captures` has added it to `_failed`.
                 self._next_index = index + 1
             else:
-                self._waiting[index] = capture
-        elif index not in self._waiting:
-            self._unanswered += 1
+                self._received[index] = capture
+        elif index not in self._received:
+            self._unanswered_requests += 1
             following_index = index + 1
-            if not can_fetch and self._waiting:  # Skip to the next capture that was received.
-                following_index = min(self._waiting)
+            if not can_fetch and self._received:  # Skip to the next capture that was received.
+                following_index = min(self._received)
             self._missed += following_index - index
             self._next_index = following_index
 
@@ -401,12 +406,12 @@ class PhotoInterval:
         checks without a capture.
         """
         status = await self._shutter.request_status(2.0 * CHECK_INTERVAL_S)
-        self._collect()
+        self._process_new_captures()
         is_ahead = status is not None and self._next_index is not None and status.image_count > self._next_index
         is_over = status is not None and not status.is_in_series and not status.is_capturing
         if status is not None and is_ahead and self._is_plausible(status.image_count - 1):
-            await self._fetch_missing()
-        elif is_over and not self._waiting and not self._failed:
+            await self._fetch_next()
+        elif is_over and not self._received and not self._failed:
             raise OperationRejected(
                 f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
             )

@@ -259,14 +259,15 @@ class Component(ReadOnly):
         subscriber = self._session.subscriber
         with subscriber.subscribe((message_type,), capacity=100, overflow="drop_oldest", rate_hz=None) as answers:
             with anyio.move_on_after(timeout):
-                for attempts_left in reversed(range(REQUEST_ATTEMPTS)):
-                    refusal = await self._request_once(message_type.ID, *params, is_last=not attempts_left)
+                for attempt in range(1, REQUEST_ATTEMPTS + 1):
+                    is_last = attempt == REQUEST_ATTEMPTS
+                    refusal = await self._request_once(message_type.ID, *params, is_last=is_last)
                     if refusal is not None:
                         wait_s = 0.0  # Return the message only if it has arrived already.
-                    elif attempts_left:
-                        wait_s = ATTEMPT_TIMEOUT_S
+                    elif is_last:
+                        wait_s = math.inf  # `timeout` ends the wait.
                     else:
-                        wait_s = math.inf  # `timeout` ends the wait after the last request.
+                        wait_s = ATTEMPT_TIMEOUT_S
                     with anyio.move_on_after(wait_s):
                         async for answer in answers:
                             if where is None or where(answer):

@@ -285,9 +285,8 @@ class Settings:
     ) -> None:
         """Read the setting itself, and the settings that restrict it, if their values are unknown."""
         name = setting_definition.name
-        to_read = [
-            setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])
-        ]
+        restricting_names = definition.dependencies(name)
+        to_read = [other for other in restricting_names if self._must_be_read(definition.settings[other])]
         if (name not in self._known or name in self._in_doubt) and not setting_definition.write_only:
             to_read.append(name)
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
@@ -370,17 +369,9 @@ class Settings:
             setting = setting.replace(index=old.index)
         new = self._known[setting.name] = self._with_definition(setting)
         if old is not None and not settings_equal(old.value, new.value):
-            transfers = self._transfers
-            transfers.connection.bus.publish(
-                SettingChanged(
-                    transfers.connection.now(),
-                    transfers.system_id,
-                    new.name,
-                    old.value,
-                    new.value,
-                    transfers.component_id,
-                )
-            )
+            transfers, now = self._transfers, self._transfers.connection.now()
+            event = SettingChanged(now, transfers.system_id, new.name, old.value, new.value, transfers.component_id)
+            transfers.connection.bus.publish(event)
 
     def _forget(self) -> None:
         self._known.clear()

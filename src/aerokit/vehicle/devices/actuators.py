@@ -241,20 +241,20 @@ class Actuators(ReadOnly):
         start: tuple[float, ...]
         stop: tuple[float, ...]
         # On ArduPilot, a test with throttle 0 for 0 s ends a running test. On PX4, a test of 0 s releases the output.
-        if not MOTOR_TEST.is_supported(session.autopilot):
-            command = MavCmd.ACTUATOR_TEST
-            unused = (0, 0)
-            start = (throttle_percent / 100, duration_s, *unused, number)
-            stop = (math.nan, 0, *unused, number)
-        else:
+        if MOTOR_TEST.is_supported(session.autopilot):
             command = MavCmd.DO_MOTOR_TEST
             motor_count = 1
             start = (number, PERCENT, throttle_percent, duration_s, motor_count)
             stop = (number, PERCENT, 0, 0, motor_count)
+        else:
+            command = MavCmd.ACTUATOR_TEST
+            unused = (0, 0)
+            start = (throttle_percent / 100, duration_s, *unused, number)
+            stop = (math.nan, 0, *unused, number)
         session.check_disarmed("test_motor", is_state_recent=arbiter.is_state_recent)
         # On ArduPilot, a new test ends the test of another motor.
         order = arbiter.device_order("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
-        spins_until = order.given_at + duration_s
+        spins_until = order.given_at + duration_s  # the earliest possible end of the test
         try:
             await SimpleOrder("test_motor", command, start).send(self._context, device_order=order)
             await anyio.sleep(duration_s)

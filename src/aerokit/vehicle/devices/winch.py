@@ -92,9 +92,10 @@ class Winch(ReadOnly):
         order = self._context.arbiter.device_order(self._topic)
         status_before: m.WinchStatus | None = None
         for _ in range(2):  # The first requests may be lost in a silence.
-            if status_before is None:
-                status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
-                await self._context.sender.await_recent_state(order)  # The vehicle may have become silent.
+            status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
+            await self._context.sender.await_recent_state(order)  # The vehicle may have become silent.
+            if status_before is not None:
+                break
         await self._send(
             WinchActions.RELATIVE_LENGTH_CONTROL,
             length_m,
@@ -208,11 +209,7 @@ class Winch(ReadOnly):
         params = (self._number, action, length_m, rate_m_s)
         effect = None if is_done is None else Effect("WinchStatus", is_done)
         await SimpleOrder(f"winch {action.name.lower()}", MavCmd.DO_WINCH, params, effect).send(
-            self._context,
-            device_order=order,
-            topic=self._topic,
-            component_id=self._component_id,
-            timeout=timeout,
+            self._context, device_order=order, topic=self._topic, component_id=self._component_id, timeout=timeout
         )
 
     def _check_supported(self, action: WinchActions) -> None:

@@ -160,26 +160,27 @@ class FileChannel:
         raise AssertionError("the loop returns or raises")
 
     async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
-        may_wait = True
-        may_be_own_session = True
+        has_waited = False
+        has_closed_own_session = False
         while True:
             request = self._session_request(opcode, path, self.client.next_session(), idle_timeout_s)
             try:
                 reply = await self.transfers.run(request)
             except FileError as error:
-                if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
+                if not has_closed_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
                     # If the reply to an earlier request was lost, this program may already have a session. Close it.
                     # PX4 has only one session: if it belongs to another station, that station must open its file again.
-                    may_be_own_session = False
+                    has_closed_own_session = True
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
                     continue
-                pause_s = SESSION_TIMEOUT_S.get(error.code)
+                # The vehicle closes another station's session after this time. None: the error has another cause.
+                session_timeout_s = SESSION_TIMEOUT_S.get(error.code)
                 # The extra second lets the default idle time-out of 10 s suffice for PX4's 10.5 s.
-                if not may_wait or pause_s is None or pause_s > idle_timeout_s + 1.0:
+                if has_waited or session_timeout_s is None or session_timeout_s > idle_timeout_s + 1.0:
                     raise
-                may_wait = False
-                await anyio.sleep(pause_s)
+                has_waited = True
+                await anyio.sleep(session_timeout_s)
             except BaseException:
                 for session in self._possible_sessions(request):
                     self._close_soon(session, path)

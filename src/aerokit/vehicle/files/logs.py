@@ -305,6 +305,7 @@ class Logs:
     ) -> tuple[LogEntry, ...]:
         autopilot, request_list = self._transfers.autopilot, self._channel.list
         logs: Sequence[LogMessage | ListedLog] | None = None
+        # PX4 does not answer if it has no logs. Its list file shows whether it has some.
         if autopilot.silent_without_logs and await self._files.is_supported():
             try:
                 logs = await request_list(idle_timeout_s, only_id, max_unanswered=MAX_UNANSWERED_REQUESTS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -61,7 +62,7 @@ class ReleaseCommand:
         self._is_still_due = is_still_due
         self._final_message = final_message
         # Component id of the manager when this object was created; another manager may be known later.
-        self._target = orders.manager_id
+        self._manager_id = orders.manager_id
 
     async def send_and_wait(self, description: str) -> None:
         """Send the command and wait for its acknowledgement.
@@ -80,7 +81,7 @@ class ReleaseCommand:
             )
         self._send()
         try:
-            await self._confirm()
+            await self._repeat_until_acknowledged()
         except asyncio.CancelledError:
             self.send_soon(was_just_sent=True)  # The command may have been lost, so it is retried in the background.
             raise
@@ -92,77 +93,66 @@ class ReleaseCommand:
         """
         if not self._session.is_open or not self._is_still_due():
             return
-        can_send_now = self._orders.context.arbiter.is_state_recent
-        if can_send_now and not was_just_sent:
+        is_vehicle_silent = not self._orders.context.arbiter.is_state_recent
+        if not is_vehicle_silent and not was_just_sent:
             self._send()
+        self._session.background.start(
+            lambda: self._finish_in_background(must_await_heartbeat=is_vehicle_silent), "aerokit gimbal"
+        )
 
-        async def send_until_acknowledged() -> None:
-            with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
-                if not can_send_now:
-                    await self._session.wait_for_heartbeat()
-                    if not self._is_still_due():
-                        return
+    async def _finish_in_background(self, *, must_await_heartbeat: bool) -> None:
+        with suppress(AerokitError):  # No call waits for the errors of a background task.
+            if must_await_heartbeat:
+                await self._session.wait_for_heartbeat()
+                if not self._is_still_due():
+                    return
+                self._send()
+            try:
+                await self._repeat_until_acknowledged()
+            except CommandTimeout:
+                if not self._is_manager_silent():
+                    raise
+                # The manager was silent, and may have missed the command. Send it again as soon as the manager is back.
+                # A late command does no harm: the manager ignores it if this program has lost control.
+                await self._orders.wait_for(lambda: not self._is_manager_silent(), Heartbeat, within_s=math.inf)
+                if self._is_still_due():
                     self._send()
-                try:
-                    await self._confirm()
-                except CommandTimeout:
-                    if not self._is_target_silent():
-                        raise
-                    # The target was silent, and may have missed the command. Send it again at the target's next
-                    # HEARTBEAT. A late command does no harm: the manager ignores it if this program has lost control.
-                    await self._wait_target_heartbeat()
-                    if self._is_still_due():
-                        self._send()
-                        await self._confirm()
-
-        self._session.background.start(send_until_acknowledged, "aerokit gimbal")
+                    await self._repeat_until_acknowledged()
 
     def _send(self) -> None:
-        self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
+        self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._manager_id)
 
-    async def _confirm(self) -> None:
+    async def _repeat_until_acknowledged(self) -> None:
+        """Wait for the acknowledgement of the command that was just sent, and repeat the command if necessary."""
         began_at = self._session.connection.now()
         with self._orders.context.arbiter.auxiliary_order(ends_with_actions=False) as order:
             await self._orders.context.sender.send_long(
                 order,
                 self._command,
                 *self._params,
-                component_id=self._target,
+                component_id=self._manager_id,
                 is_done=lambda: not self._is_still_due(),
                 attempts=RELEASE_ATTEMPTS,
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
                 was_just_sent=True,
             )
         if self._final_message is not None:
-            await self._send_repeatedly(self._final_message, began_at)
+            await self._send_several_times(self._final_message, command_sent_at=began_at)
 
-    async def _send_repeatedly(self, message: Message, began_at: float) -> None:
+    async def _send_several_times(self, message: Message, *, command_sent_at: float) -> None:
         arbiter = self._orders.context.arbiter
         for _ in range(FINAL_MESSAGE_COUNT):
-            # After a pause of this program, another station may use the gimbal.
-            was_paused = arbiter.slept_since(began_at) > 0 or not arbiter.is_state_recent
-            if was_paused or not self._session.is_open or not self._is_still_due():
+            # While the computer slept or the vehicle was silent, another station may have begun to use the gimbal.
+            has_computer_slept = arbiter.slept_since(command_sent_at) > 0
+            is_vehicle_silent = not arbiter.is_state_recent
+            if has_computer_slept or is_vehicle_silent or not self._session.is_open or not self._is_still_due():
                 return
             self._session.connection.send(message)
             await asyncio.sleep(FINAL_MESSAGE_INTERVAL_S)
 
-    def _is_target_silent(self) -> bool:
-        is_autopilot = self._target == self._session.component_id
-        return not is_autopilot and self._orders.registry.silent_for_s(self._target) > SILENT_AFTER_S
-
-    async def _wait_target_heartbeat(self) -> None:
-        received = asyncio.Event()
-
-        def on_heartbeat(heartbeat: Heartbeat) -> None:
-            frame = heartbeat.received_frame
-            if frame is not None and frame.component_id == self._target:
-                received.set()
-
-        detach = self._session.connection.bus.attach(Heartbeat, on_heartbeat, system_id=self._session.system_id)
-        try:
-            await received.wait()
-        finally:
-            detach()
+    def _is_manager_silent(self) -> bool:
+        is_autopilot = self._manager_id == self._session.component_id
+        return not is_autopilot and self._orders.registry.silent_for_s(self._manager_id) > SILENT_AFTER_S
 
 
 # Seconds after which the manager's confirmation of our control is requested, and seconds to wait for it in total.
@@ -199,12 +189,12 @@ class GimbalControl:
         self._device: GimbalDevice | None = None
         self._control_request = ControlRequest(0, 0, is_primary=is_primary)  # `__aenter__` replaces it.
         # The error that describes the loss of control; None until control is lost.
-        self._taken: GimbalTaken | None = None
+        self._loss: GimbalTaken | None = None
         self._was_loss_raised = False
         self._was_entered = False
         self._is_ended = False
         # Set when control is lost, or when the block or the connection ends. `until_lost` waits for it.
-        self._lost = asyncio.Event()
+        self._lost_or_ended = asyncio.Event()
         self._detach_callbacks: list[Callable[[], None]] = []
 
     @property
@@ -215,12 +205,12 @@ class GimbalControl:
     @property
     def is_held(self) -> bool:
         """True while your program is in control."""
-        return self._device is not None and self._taken is None and not self._is_ended
+        return self._device is not None and self._loss is None and not self._is_ended
 
     @property
     def is_taken(self) -> bool:
         """True if another station has taken control, or has released your control."""
-        return self._taken is not None
+        return self._loss is not None
 
     async def until_lost(self) -> tuple[int, int]:
         """Wait until control is lost; return the system and component id of the new controller, (0, 0) for none.
@@ -229,16 +219,16 @@ class GimbalControl:
             OperationRejected: the block ended.
             ConnectionClosed, LinkLost: the connection ended.
         """
-        detach = self._session.end.on_end(lambda _: self._lost.set())  # Stop waiting when the session ends.
+        detach = self._session.end.on_end(lambda _: self._lost_or_ended.set())  # Stop waiting when the session ends.
         try:
-            await self._lost.wait()
+            await self._lost_or_ended.wait()
         finally:
             detach()
         self._session.end.raise_if_ended()
-        if self._taken is None:
+        if self._loss is None:
             raise OperationRejected(f"{self._orders.name}: the block that had control has ended")
         self._was_loss_raised = True
-        return self._taken.system_id, self._taken.component_id
+        return self._loss.system_id, self._loss.component_id
 
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if control was lost.
@@ -246,11 +236,11 @@ class GimbalControl:
         Raises:
             GimbalTaken: another station has taken control, or the manager reports that no station has it.
         """
-        if self._taken is not None:
+        if self._loss is not None:
             self._was_loss_raised = True
-            taken = self._taken
+            loss = self._loss
             # Create a new exception each time, because an exception that is raised again also keeps its old tracebacks.
-            raise GimbalTaken(str(taken), system_id=taken.system_id, component_id=taken.component_id)
+            raise GimbalTaken(str(loss), system_id=loss.system_id, component_id=loss.component_id)
 
     async def __aenter__(self) -> Self:
         """Request control, and wait until the manager confirms it."""
@@ -285,7 +275,7 @@ class GimbalControl:
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Release control. If it was lost, and no call has reported that yet, raise GimbalTaken instead."""
-        if self._taken is not None:
+        if self._loss is not None:
             self._end()
             if error is None and not self._was_loss_raised:
                 self.raise_if_taken()
@@ -338,18 +328,18 @@ class GimbalControl:
 
     def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
         controller = self._controller_in(controllers)
-        if controller == self._orders.own_ids or self._taken is not None:
+        if controller == self._orders.own_ids or self._loss is not None:
             return
         system_id, component_id = controller
         holder = f"{system_id}/{component_id}" if controller != (0, 0) else "no controller"
-        self._taken = GimbalTaken(
+        self._loss = GimbalTaken(
             f"{self._orders.name}: control was lost: {holder} has control now",
             system_id=system_id,
             component_id=component_id,
         )
         device_id = 0 if self._device is None else self._device.device_id
         self._session.publish(GimbalControlLost, device_id, self._is_primary, system_id, component_id)
-        self._lost.set()
+        self._lost_or_ended.set()
 
     def _controller_in(self, controllers: GimbalControllers) -> tuple[int, int]:
         return controllers.primary if self._is_primary else controllers.secondary
@@ -360,9 +350,8 @@ class GimbalControl:
         requests = orders.registry.control_requests
 
         def is_still_due() -> bool:
-            if self._taken is not None:
-                return False
-            return not self._control_request.leave_release_to(requests)
+            # If another open block of this program has the same control, that block releases it when it ends.
+            return self._loss is None and not self._control_request.leave_release_to(requests)
 
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 
@@ -374,7 +363,7 @@ class GimbalControl:
     def _end(self) -> None:
         """Forget the control that this block has. Sends nothing."""
         self._is_ended = True
-        self._lost.set()  # This ends all calls of `until_lost`.
+        self._lost_or_ended.set()  # This ends all calls of `until_lost`.
         requests = self._orders.registry.control_requests
         if self._control_request in requests:
             requests.remove(self._control_request)

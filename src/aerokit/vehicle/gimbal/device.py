@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
     from aerokit.connection.bus import Detach
     from aerokit.mavlink.message import Message
-    from aerokit.mavlink.messages import (
-        GimbalDeviceInformation,
-        GimbalManagerInformation,
-        GimbalManagerStatus,
-    )
+    from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation, GimbalManagerStatus
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Topic
     from aerokit.vehicle.session.session import VehicleSession
@@ -249,10 +245,10 @@ class GimbalDevice:
         secondary = (message.secondary_control_sysid, message.secondary_control_compid)
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
-    def update_manager(self, component_id: int, rank: int, *, is_old_gone: bool) -> None:
+    def update_manager(self, component_id: int, rank: int, *, is_known_manager_gone: bool) -> None:
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
-        elif self.manager_id is None or rank > self._manager_rank or is_old_gone:
+        elif self.manager_id is None or rank > self._manager_rank or is_known_manager_gone:
             self.manager_id = component_id
             self._manager_rank = rank
             self._newest_status = None  # The time stamps of the new manager are from another clock.

@@ -42,6 +42,7 @@ class GimbalRegistry:
 
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
+        # Maps (component id, number) to the gimbal; the number is 0 if the component itself is the gimbal.
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
         # Represents the first gimbal until one is discovered, and receives the values of the first gimbal afterwards.
         # MOUNT_STATUS and MOUNT_ORIENTATION, which have no gimbal id, set only the values of this placeholder.
@@ -55,12 +56,12 @@ class GimbalRegistry:
         self._steady_since = math.inf
         context.session.on_reboot.append(self._on_reboot)
         self._listen(Heartbeat, self._record_received)
-        self._listen(GimbalDeviceAttitudeStatus, self._on_device)
+        self._listen(GimbalDeviceAttitudeStatus, self._on_attitude)
         self._listen(MountStatus, lambda message: self.placeholder.set_attitude(message, from_status(message)))
         self._listen(MountOrientation, self._on_orientation)
-        self._listen(GimbalManagerStatus, self._on_status)
-        self._listen(GimbalManagerInformation, self._on_manager)
-        self._listen(GimbalDeviceInformation, self._on_information)
+        self._listen(GimbalManagerStatus, self._on_manager_status)
+        self._listen(GimbalManagerInformation, self._on_manager_information)
+        self._listen(GimbalDeviceInformation, self._on_device_information)
 
     @property
     def first(self) -> GimbalDevice:
@@ -98,7 +99,7 @@ class GimbalRegistry:
         # A gimbal attached to the autopilot takes precedence over others with the same id.
         return min(matching, key=lambda device: (device.component_id != autopilot_id, device.key), default=None)
 
-    def device(self, component_id: int, number: int) -> GimbalDevice | None:
+    def get_or_create(self, component_id: int, number: int) -> GimbalDevice | None:
         """Return a gimbal, and create it if needed. Return None if there are ``MAX_GIMBALS`` others."""
         key = (component_id, number)
         device = self.devices.get(key)
@@ -135,14 +136,14 @@ class GimbalRegistry:
         is_sender = device_id > MAX_GIMBAL_NUMBER or (device_id == 0 and has_own_id)
         attached_number = device_id or 1  # Older autopilots send 0 for their gimbal.
         number = 0 if is_sender else attached_number
-        return self._marked_discovered(self.device(component_id, number))
+        return self._marked_discovered(self.get_or_create(component_id, number))
 
     def _marked_discovered(self, device: GimbalDevice | None) -> GimbalDevice | None:
         if device is not None:
             device.is_discovered = True
         return device
 
-    def _on_device(self, message: GimbalDeviceAttitudeStatus) -> None:
+    def _on_attitude(self, message: GimbalDeviceAttitudeStatus) -> None:
         device = self._device_of(message, message.gimbal_device_id)
         if device is None:
             return
@@ -159,7 +160,7 @@ class GimbalRegistry:
         if self.first_reporting is None:
             self.placeholder.set_attitude(message, from_orientation(message, self.heading()))
 
-    def _on_status(self, message: GimbalManagerStatus) -> None:
+    def _on_manager_status(self, message: GimbalManagerStatus) -> None:
         device = self._managed_device(message, message.gimbal_device_id)
         if device is None:
             return
@@ -167,7 +168,7 @@ class GimbalRegistry:
         if is_newest and device is self.first:
             self.placeholder.set_controllers(message)
 
-    def _on_manager(self, message: GimbalManagerInformation) -> None:
+    def _on_manager_information(self, message: GimbalManagerInformation) -> None:
         device = self._managed_device(message, message.gimbal_device_id)
         if device is not None:
             device.manager_information = message
@@ -195,18 +196,17 @@ class GimbalRegistry:
             rank = max(rank, RANK_INFORMATION)
         if device is None:
             return None
-        is_old_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)
-        device.update_manager(sender, rank, is_old_gone=is_old_gone)
+        is_known_manager_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)
+        device.update_manager(sender, rank, is_known_manager_gone=is_known_manager_gone)
         return device if device.manager_id == sender else None
 
     def _device_with_own_id(self, device_id: int, *, may_be_new: bool) -> GimbalDevice | None:
         # GIMBAL_MANAGER_STATUS may name a device that does not exist; GIMBAL_MANAGER_INFORMATION names existing ones.
-        key = (device_id, 0)
-        if key in self.devices or (may_be_new and device_id in GIMBAL_COMPONENT_IDS):
-            return self._marked_discovered(self.device(*key))
+        if (device_id, 0) in self.devices or (may_be_new and device_id in GIMBAL_COMPONENT_IDS):
+            return self._marked_discovered(self.get_or_create(device_id, number=0))
         return None
 
-    def _on_information(self, message: GimbalDeviceInformation) -> None:
+    def _on_device_information(self, message: GimbalDeviceInformation) -> None:
         device = self._device_of(message, message.gimbal_device_id)
         if device is not None:
             device.device_information = message

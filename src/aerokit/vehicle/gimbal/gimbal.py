@@ -202,14 +202,18 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         manager_id = await orders.find_manager()
         failure: CommandRejected | CommandTimeout | None = None
         # Messages that were received before do not count as answers.
-        before = (orders.device.manager_information, orders.device.device_information)
+        old_manager = orders.device.manager_information
+        old_device = orders.device.device_information
+
+        def has_manager_answered() -> bool:
+            return _is_new(orders.device.manager_information, old_manager)
+
+        def has_device_answered() -> bool:
+            return _is_new(orders.device.device_information, old_device)
+
         try:
             await orders.ask(GimbalManagerInformation.ID, manager_id)
-            await orders.wait_for(
-                lambda: _is_new(orders.device.manager_information, before[0]),
-                GimbalManagerInformation,
-                INFORMATION_TIMEOUT_S,
-            )
+            await orders.wait_for(has_manager_answered, GimbalManagerInformation, INFORMATION_TIMEOUT_S)
         except (CommandRejected, CommandTimeout) as error:
             failure = error
         device = orders.device
@@ -217,24 +221,20 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         if failure is None or not is_placeholder:  # The component id to ask is known.
             has_own_id = not is_placeholder and device.number == 0
             target = device.component_id if has_own_id else manager_id
-            try:
+            with suppress(CommandRejected, CommandTimeout):
+                # For a servo gimbal, autopilots do not send GIMBAL_DEVICE_INFORMATION.
                 await orders.ask(GimbalDeviceInformation.ID, target, attempts=1)
-                await orders.wait_for(
-                    lambda: _is_new(orders.device.device_information, before[1]),
-                    GimbalDeviceInformation,
-                    INFORMATION_TIMEOUT_S,
-                )
-            except (CommandRejected, CommandTimeout):
-                pass  # For a servo gimbal, autopilots do not send GIMBAL_DEVICE_INFORMATION.
-        device = orders.device
-        messages = (device.manager_information, device.device_information)
-        if not any(map(_is_new, messages, before)):
+                await orders.wait_for(has_device_answered, GimbalDeviceInformation, INFORMATION_TIMEOUT_S)
+        if not has_manager_answered() and not has_device_answered():
             raise failure or CommandTimeout(
                 f"{orders.name}: the request for information was accepted, but no information was received;"
                 f" {self._session.describe_link()}"
             )
+        device = orders.device  # The answers may have shown that another gimbal is the first one.
         device.checks_limits = True
-        return information_of(device.device_id, orders.manager_id, *messages)
+        return information_of(
+            device.device_id, orders.manager_id, device.manager_information, device.device_information
+        )
 
     def control(self, *, secondary: bool = False) -> GimbalControl:
         """Control the gimbal for the duration of an ``async with`` block; see :class:`GimbalControl`.
@@ -242,7 +242,7 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         Args:
             secondary: take secondary control, alongside the station that has primary control.
         """
-        return GimbalControl(self._orders, not secondary)
+        return GimbalControl(self._orders, is_primary=not secondary)
 
     def rates(
         self,
@@ -308,10 +308,10 @@ class Gimbals:
         """
         check_range("device_id", device_id, 1, 255)
         device = self._registry.find(device_id)
-        if device is None:
-            is_numbered = device_id <= MAX_GIMBAL_NUMBER
-            key = (self._context.session.component_id, device_id) if is_numbered else (device_id, 0)
-            device = self._registry.device(*key)
+        if device is None and device_id <= MAX_GIMBAL_NUMBER:  # It is attached to the autopilot.
+            device = self._registry.get_or_create(self._context.session.component_id, number=device_id)
+        elif device is None:
+            device = self._registry.get_or_create(device_id, number=0)
         if device is None:
             raise BusyError(f"there are {MAX_GIMBALS} gimbals already: {', '.join(map(str, self.ids))}")
         return self._gimbal(device)
@@ -331,10 +331,7 @@ class Gimbals:
             # One component may refuse, although others send the message.
             with suppress(CommandRejected, CommandTimeout):
                 await session.commands.send_long(
-                    MavCmd.REQUEST_MESSAGE,
-                    GimbalManagerInformation.ID,
-                    component_id=BROADCAST_COMPONENT,
-                    attempts=2,
+                    MavCmd.REQUEST_MESSAGE, GimbalManagerInformation.ID, component_id=BROADCAST_COMPONENT, attempts=2
                 )
         await anyio.sleep(max(0.0, deadline - session.connection.now()))
         session.end.raise_if_ended()

@@ -7,6 +7,8 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+import anyio
+
 from aerokit._internal.formatting import short_repr
 from aerokit.autopilots import GimbalRules
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
@@ -157,7 +159,7 @@ class GimbalOrders:
                 commands = self.session.commands
                 await self.context.sender.run_command(
                     sent_order,
-                    commands.send_int if place else commands.send_long,
+                    commands.send_int if place else commands.send_long,  # Only COMMAND_INT can have a place.
                     command,
                     *params,
                     component_id=self.manager_id,
@@ -251,11 +253,10 @@ class GimbalOrders:
             return
         bus = self.session.connection.bus
         detach = bus.attach(message_type, check, system_id=self.session.system_id)
-        timer = asyncio.get_running_loop().call_later(within_s, done.set)
         try:
-            await done.wait()
+            with anyio.move_on_after(within_s):
+                await done.wait()
         finally:
-            timer.cancel()
             detach()
 
     async def find_manager(self) -> int:

@@ -306,10 +306,11 @@ class PointingMixin(GimbalMixin):
                 return
             await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
 
-        angles = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
         if not wait:
             await send()
             return
+        # Without an ordered roll, any roll is accepted.
+        angles = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
         with attitude_stream(orders):
             since = self._now()
             await send()

@@ -68,7 +68,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._began_at = -math.inf
         self._order: Order | None = None
         # The error that describes the loss of control; None until control is lost.
-        self._taken: AerokitError | None = None
+        self._loss: AerokitError | None = None
         # Marks the gimbal as in use until it is closed, so that ``vehicle.gimbal`` does not become another gimbal.
         self._cleanup = ExitStack()
 
@@ -118,19 +118,18 @@ class GimbalRates(ValueStream[tuple[float, float]]):
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Stop the gimbal. If the stream has already stopped, raise its error instead."""
-        reason = self._takeover_reason() if self._stop_error is None else None
-        if reason:
-            self._stop(reason, hold=False)
+        if self._stop_error is None and (reason := self._takeover_reason()):
+            self._stop(reason, hold=False)  # This sets `_stop_error`.
         if self._stop_error is None:
             # Create the command before `_end`: afterwards it might address another gimbal.
-            zero = self._zero_rates_command()
+            stop_command = self._zero_rates_command()
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
-                await zero.send_and_wait(f"{self._orders.name}: rates of zero")
+                await stop_command.send_and_wait(f"{self._orders.name}: rates of zero")
                 self._orders.raise_if_taken()  # If control was lost meanwhile, the gimbal may still turn.
             else:
-                zero.send_soon()
+                stop_command.send_soon()
         elif error is None and not self._has_raised_stop:
             raise self._stop_error
 
@@ -160,17 +159,17 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         try:
             self._orders.raise_if_taken()
         except AerokitError as error:
-            self._taken = error
+            self._loss = error
             return str(error)
         return SUPERSEDED if self._order is not None and not self._order.is_newest else None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        zero = self._zero_rates_command()
+        stop_command = self._zero_rates_command()  # Created before the end, as in `__aexit__`.
         super()._stop(reason, hold=hold)
         if hold:
-            zero.send_soon()
-        if self._taken is not None:
-            self._stop_error = self._taken
+            stop_command.send_soon()
+        if self._loss is not None:
+            self._stop_error = self._loss
 
     def _zero_rates_command(self) -> ReleaseCommand:
         orders, order = self._orders, self._order

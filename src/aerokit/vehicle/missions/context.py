@@ -323,14 +323,15 @@ class MissionTracker:
             self._is_approached_again = True
 
     def _on_state(self, state: int) -> None:
-        if state != _COMPLETE:
-            self.stale_until = -math.inf
-            must_start = state == _ACTIVE and (self.is_complete or not self._has_begun)
-            if must_start and self.is_in_mission_mode and self._session.telemetry.is_armed:
-                self._has_begun = True
-                self.is_complete = self._was_replaced = False
-        elif self._session.connection.now() >= self.stale_until:
-            self._complete()
+        if state == _COMPLETE:
+            if self._session.connection.now() >= self.stale_until:
+                self._complete()
+            return
+        self.stale_until = -math.inf
+        is_new_flight = state == _ACTIVE and (self.is_complete or not self._has_begun)
+        if is_new_flight and self.is_in_mission_mode and self._session.telemetry.is_armed:
+            self._has_begun = True
+            self.is_complete = self._was_replaced = False
 
     def _on_mode(self, *_: object) -> None:
         self._mode_changed_at = self._session.connection.now()

@@ -76,15 +76,14 @@ class MissionEndDetector:
         self._session = session
         self._tracker = tracker
         self._mode = mode
-        self._order = vehicle_context.arbiter.newest  # the newest order when the wait began
+        self._newest_order_at_start = vehicle_context.arbiter.newest
         last_command = items[-1].command if items else None
-        self._ending = Ending.OTHER
         if last_command is None:
             self._ending = Ending.UNKNOWN
         elif last_command == MavCmd.NAV_RETURN_TO_LAUNCH and not session.autopilot.lands_after_return:
             self._ending = Ending.RETURN
-        elif last_command in LANDING_PURPOSES:
-            self._ending = Ending.LANDING
+        else:
+            self._ending = Ending.LANDING if last_command in LANDING_PURPOSES else Ending.OTHER
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         # Modes in which the vehicle may land. If the last item is a landing or a return, only the mode of this item.
@@ -152,13 +151,13 @@ class MissionEndDetector:
         is_complete, lands = self._tracker.is_present_plan_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
 
-    def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
+    def failure(self, mission_order: Order | None, *, is_paused: bool) -> str | None:
         """Return the reason why the vehicle will not fly the mission to its end, or None.
 
-        ``order`` is the last order for the mission.
+        ``mission_order`` is the last order to start, pause or resume the mission.
         """
         session, now = self._session, self._session.connection.now()
-        if self._vehicle_context.arbiter.newest not in (self._order, order):
+        if self._vehicle_context.arbiter.newest not in (self._newest_order_at_start, mission_order):
             return "another order was given"
         fall = self.ground.fall()
         if fall:
@@ -466,22 +465,24 @@ class MissionControl(VehiclePlan["Mission"]):
             try:
                 await self._set_current_by_message(seq, timeout, sent)
             except OperationTimeout as error:
-                if not order.end:
+                if not order.end:  # The order has not ended, so the vehicle did not confirm it in time.
                     raise
-                # The item itself may have changed the mode: PX4 leaves MISSION for a return.
-                if order.is_newest:
-                    reported = self._tracker.current
-                    with anyio.move_on_after(END_GRACE_S):
-                        # A report from before the order does not confirm it.
-                        await reported.wait_until(lambda now: now == item and reported.updated_at > order.given_at)
-                        return
+                # The item itself may have ended the order by a change of the mode: PX4 leaves MISSION for a return.
+                if order.is_newest and await self._is_reported_soon(item, since=order.given_at):
+                    return
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
+
+    async def _is_reported_soon(self, item: int, *, since: float) -> bool:
+        reported = self._tracker.current
+        with anyio.move_on_after(END_GRACE_S):
+            await reported.wait_until(lambda current: current == item and reported.updated_at > since)
+            return True
+        return False
 
     async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand) -> None:
         from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
-        target = (transfers.system_id, transfers.component_id)
         with transfers.limit(timeout):
             await self._context.lock.acquire()  # PX4 ignores MISSION_SET_CURRENT during a transfer.
         try:
@@ -489,7 +490,8 @@ class MissionControl(VehiclePlan["Mission"]):
             await self._vehicle_context.sender.await_recent_state(sent.order)
             await transfers.run(
                 SetCurrentItem(
-                    *target,
+                    transfers.system_id,
+                    transfers.component_id,
                     seq,
                     self._current_seq,
                     order_status=sent,

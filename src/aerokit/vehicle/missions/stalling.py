@@ -53,7 +53,7 @@ class MissionStallDetector:
         self._mode = mode
         self._items = items or ()
         self._is_paused = is_paused
-        self._stall = StallDetector(session)
+        self._stall_detector = StallDetector(session)
         # The item at which the vehicle had to move at the last call; None if it was allowed to stand still.
         self._moving_item: int | None = None
         # Time since which the vehicle has had to move at this item.
@@ -64,19 +64,19 @@ class MissionStallDetector:
         progress, current = self._tracker.progress.latest, self._tracker.current.latest
         is_paused = self._is_paused() or (progress is not None and progress.state == MissionState.PAUSED)
         if is_paused or not self._session.telemetry.is_armed:
-            self._stall = StallDetector(self._session)
+            self._stall_detector = StallDetector(self._session)
             return None
         should_move = self._should_move(current)
-        standstill = self._stall()  # None unless the vehicle has stood still for 12 s
+        standstill = self._stall_detector()  # None unless the vehicle has stood still for 12 s
         # A standstill after a fast descent is a fall. In the air, the vehicle may instead hover at its current item.
-        if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
+        if standstill is not None and self._stall_detector.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.
             self._moving_item = current if should_move else None
             self._should_move_since = self._session.connection.now()
             return None
         is_late = self._session.connection.now() - self._should_move_since >= MISSION_STALL_TIMEOUT_S
-        return self._stall(MISSION_STALL_TIMEOUT_S) if is_late else None
+        return self._stall_detector(MISSION_STALL_TIMEOUT_S) if is_late else None
 
     def _should_move(self, current: int | None) -> bool:
         if current is None or current >= len(self._items):

@@ -315,7 +315,9 @@ class PlanTransfer(Generic[PlanT]):
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
-        if (result.is_confirmed and not verify) or await self._is_verified_by_checksum(items):
+        if result.is_confirmed and not verify:
+            return
+        if await self._is_verified_by_checksum(items):
             return
         try:
             await self._verify(items, method)
@@ -362,15 +364,18 @@ class PlanTransfer(Generic[PlanT]):
             return True
         if changed_seqs is None or not self._is_worthwhile(changed_seqs, len(items)):
             return False
+        return await self._replace_items(items, changed_seqs, verify=verify)
+
+    async def _replace_items(self, items: Sequence[MissionItem], changed_seqs: list[int], *, verify: bool) -> bool:
         vehicle_items = list(self._cache.items or ())
         # The vehicle's plan is unknown until all parts are confirmed, because the call may fail or be cancelled.
         self._cache.forget(self._context.now())
-        changes = self._cache.changes
+        changes_before = self._cache.changes
         for part in _consecutive_ranges(changed_seqs):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
                 return False  # The vehicle does not support partial uploads.
             vehicle_items[part.start : part.stop] = items[part.start : part.stop]
-        if self._cache.changes != changes:  # Another station has replaced the plan meanwhile.
+        if self._cache.changes != changes_before:  # Another station has replaced the plan meanwhile.
             return False
         self._cache.set(vehicle_items, self._context.now())
         return True

@@ -96,7 +96,7 @@ class ParameterAccess:
             cached_list = None
             if cache is not False and self._transfers.autopilot.has_parameter_hash:
                 cached_list = _CachedList(self, ParameterCache(None if cache is True else cache), idle_timeout_s)
-                is_loaded = await cached_list.load_if_current(refresh)
+                is_loaded = await cached_list.load_if_current(refresh=refresh)
                 if is_loaded:
                     return self.store.table
             while True:
@@ -130,21 +130,15 @@ class ParameterAccess:
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         # Some relays drop only MAVFTP, so do not wait for the idle time-out.
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
-        has_answer = False
 
         def on_message(message: FileTransferProtocol) -> None:
-            nonlocal has_answer
             # The vehicle also answers other stations.
-            has_answer |= is_addressed_to(message, connection.source_system, connection.source_component)
+            if is_addressed_to(message, connection.source_system, connection.source_component):
+                timer.cancel()
 
-        detach = connection.bus.attach(FileTransferProtocol, on_message, system_id=self._transfers.system_id)
         with anyio.CancelScope() as scope:
-
-            def cancel_without_answer() -> None:
-                if not has_answer:
-                    scope.cancel()
-
-            timer = asyncio.get_running_loop().call_later(timeout_s, cancel_without_answer)
+            timer = asyncio.get_running_loop().call_later(timeout_s, scope.cancel)
+            detach = connection.bus.attach(FileTransferProtocol, on_message, system_id=self._transfers.system_id)
             try:
                 yield
             finally:
@@ -216,7 +210,7 @@ class ParameterAccess:
         from aerokit.protocols.parameter_requests import ParameterReads
 
         transfers, store = self._transfers, self.store
-        stale_values = {name: store.stale(name) for name in names}
+        stale_values = {name: store.stale_value(name) for name in names}
         exchange = ParameterReads(
             transfers.system_id,
             transfers.component_id,
@@ -230,19 +224,19 @@ class ParameterAccess:
             idle_timeout_s=idle_timeout_s,
         )
         if len(names) > MAX_READS_AT_DEFAULT_RATE:
-            raise_after_s: float | None = 0.0
+            raise_rate_after_s: float | None = 0.0
         elif probe:
-            raise_after_s = RAISE_DELAY_S
+            raise_rate_after_s = RAISE_DELAY_S
         else:
-            raise_after_s = None
-        with self._raised_rate(raise_after_s):
+            raise_rate_after_s = None
+        with self._raised_rate(raise_rate_after_s):
             return await transfers.run(exchange)
 
-    def _read_later(self, name: str, time: float) -> None:
-        """Read a parameter in the background at ``time`` (loop's clock)."""
+    def _read_later(self, name: str, at: float) -> None:
+        """Read a parameter in the background, at a time of the event loop's clock."""
 
         async def read() -> None:
-            await anyio.sleep(time - self._transfers.connection.now())
+            await anyio.sleep(at - self._transfers.connection.now())
             self._read_later_names.discard(name)
             with suppress(AerokitError):
                 # The answer corrects the stored value, which may be wrong.
@@ -318,9 +312,9 @@ class ParameterAccess:
             on_progress=on_progress,
         )
         # A higher rate of answers is worth its cost only for many reads.
-        raise_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
+        raise_rate_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
         try:
-            with self._raised_rate(raise_after_s):
+            with self._raised_rate(raise_rate_after_s):
                 answers = await transfers.run(exchange)
         finally:
             # Recorded after a failed or cancelled write, too, because its answers may arrive late.
@@ -430,7 +424,8 @@ class _CachedList:
         self._access, self._cache, self._idle_timeout_s = access, cache, idle_timeout_s
         self._hash: int | None = None
 
-    async def load_if_current(self, refresh: bool) -> bool:
+    async def load_if_current(self, *, refresh: bool) -> bool:
+        """Use the cached list. Return False if it is outdated, or if ``refresh`` is True."""
         store = self._access.store
         key = await self._key()
         updates_before = store.updates

@@ -16,13 +16,7 @@ from aerokit.parameters import Parameter, ParameterTable, check_name
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S
 from aerokit.vehicle.parameters.access import CacheChoice, DownloadMethod, ParameterAccess, UploadMethod
 from aerokit.vehicle.parameters.transaction import RestoreRegistry, TemporaryParameters, Transaction
-from aerokit.vehicle.parameters.writing import (
-    NameResolver,
-    Outcome,
-    ParameterWrite,
-    ParameterWriter,
-    check_values,
-)
+from aerokit.vehicle.parameters.writing import NameResolver, Outcome, ParameterWrite, ParameterWriter, check_values
 
 if TYPE_CHECKING:
     from aerokit.parameters import Metadata, ParameterDifference
@@ -322,10 +316,7 @@ class Parameters(ReadOnly):
     def _note_of(self, name: str, value: float) -> str:
         if self._metadata is None or name not in self._metadata:
             return ""
-        notes = [
-            self._metadata[name].problem(value),
-            "needs a reboot" if self._needs_reboot(name) else None,
-        ]
+        notes = [self._metadata[name].problem(value), "needs a reboot" if self._needs_reboot(name) else None]
         return "; ".join(filter(None, notes))
 
     def _needs_reboot(self, name: str) -> bool:

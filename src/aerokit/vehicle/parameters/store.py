@@ -84,7 +84,7 @@ class ParameterStore:
         """Undo `set_stale` before a new write, which may set the parameter to the same value again."""
         self._stale.pop(name, None)
 
-    def stale(self, name: str) -> StaleValue | None:
+    def stale_value(self, name: str) -> StaleValue | None:
         """Return the value that is ignored in messages, or None."""
         stale = self._stale.get(name)
         return stale if stale is not None and self._transfers.connection.now() < stale.ignored_until else None
@@ -136,7 +136,7 @@ class ParameterStore:
         name, old = received.name, self._known.get(received.name)
         if old is None and len(self._known) >= MAX_PARAMETERS:
             return  # A faulty vehicle may send new names without end.
-        stale = self.stale(name)
+        stale = self.stale_value(name)
         if old is not None and stale is not None and not same_value(received.value, old.value):
             # This message is from before the last write, or another station has written the parameter.
             self._read_later(name, stale.ignored_until)
@@ -153,17 +153,9 @@ class ParameterStore:
     def _publish(self, old: Parameter | None, new: Parameter) -> None:
         if old is None or same_value(old.value, new.value):
             return
-        transfers = self._transfers
-        transfers.connection.bus.publish(
-            ParameterChanged(
-                transfers.connection.now(),
-                transfers.system_id,
-                new.name,
-                old.value,
-                new.value,
-                transfers.component_id,
-            )
-        )
+        transfers, now = self._transfers, self._transfers.connection.now()
+        event = ParameterChanged(now, transfers.system_id, new.name, old.value, new.value, transfers.component_id)
+        transfers.connection.bus.publish(event)
 
 
 CACHE_FORMAT = 1

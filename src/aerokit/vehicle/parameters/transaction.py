@@ -43,7 +43,7 @@ class RestoreRegistry:
 
     @asynccontextmanager
     async def exclusive(self, timeout: float | None = None) -> AsyncIterator[None]:
-        """Wait, at most ``timeout`` seconds, until no other block saves or restores values.
+        """Run the block when no other block saves or restores values, but after ``timeout`` seconds in any case.
 
         A block that saves a value while another block restores it would save, and later restore, a temporary value.
         """
@@ -156,26 +156,28 @@ class _Block:
         began_at = anyio.current_time()
         # If another block waits long for an answer, restore the values of this block without waiting for it.
         async with self._registry.exclusive(self._idle_timeout_s):
-            saved = self._take_saved()
+            to_restore = self._take_saved()
             # Recorded before the write: a block that reads a temporary value meanwhile must save these values instead.
-            self._registry.restored.update({param.name: param for param in saved})
+            self._registry.restored.update({param.name: param for param in to_restore})
             # A blocked event loop may have lengthened the wait. This must not use up the time to restore the values.
             waited_s = min(anyio.current_time() - began_at, self._idle_timeout_s)
             with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s - waited_s):
                 try:
                     # Keep values that another station has changed. Without a confirmed write of ours (None), there is
                     # no value to compare with.
-                    comparable = [param.name for param in saved if self._access.written.get(param.name) is not None]
-                    present = await self._access.read(comparable, self._idle_timeout_s)
-                    saved = [param for param in saved if not self._was_changed(param.name, present.get(param.name))]
+                    confirmed = [param.name for param in to_restore if self._access.written.get(param.name) is not None]
+                    present = await self._access.read(confirmed, self._idle_timeout_s)
+                    to_restore = [
+                        param for param in to_restore if not self._was_changed(param.name, present.get(param.name))
+                    ]
                     # A parameter that cannot be read may have another station's value, so it is not overwritten.
                     unreadable = {name for name, answer in present.items() if not isinstance(answer, Parameter)}
-                    to_write = [param for param in saved if param.name not in unreadable]
+                    to_write = [param for param in to_restore if param.name not in unreadable]
                     answers = await self._access.write(to_write, self._idle_timeout_s)
                 except AerokitError as error:
                     reason = f" ({error})"
         _raise_not_restored(
-            [param for param in saved if not _is_restored(param, answers.get(param.name))], reason, cause
+            [param for param in to_restore if not _is_restored(param, answers.get(param.name))], reason, cause
         )
 
     def _abandon(self, error: AerokitError, cause: BaseException | None) -> None:

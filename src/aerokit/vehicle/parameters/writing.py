@@ -76,10 +76,13 @@ class NameResolver:
         """Resolve names, reading parameters that are unknown. Warns of renamed parameters."""
         normalized = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
+        store = self._access.store
         answers = await self._access.read(self._names_in_doubt(normalized.values()), idle_timeout_s)
         # If the vehicle reboots meanwhile, the store is cleared, and parameters that were known must also be read.
         while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:
-            answers |= await self._access.read(to_read, idle_timeout_s, probe=True)
+            read = await self._access.read(to_read, idle_timeout_s, probe=True)
+            # An error is wrong if the value has arrived right after it, as late answers do in a burst.
+            answers |= {name: read[name] for name in read if isinstance(read[name], Parameter) or name not in store}
         for requested, name in normalized.items():
             result = self._resolve_one(name, answers)
             if isinstance(result, ResolvedParameter):
@@ -281,10 +284,10 @@ class ParameterWriter:
         resolve = resolve or self.names.resolve
         results: dict[str, ParameterWrite] = {}
         pending = check_values(values)
-        for attempt in range(MAX_ROUNDS):
+        for round_number in range(MAX_ROUNDS):
             resolved = await resolve(pending, idle_timeout_s)
             count_before = self._access.store.count
-            plans, errors = self._plan_writes(resolved, pending, is_first=attempt == 0)
+            plans, errors = self._plan_writes(resolved, pending, is_first_round=round_number == 0)
             answers = await self._send(plans, upload, idle_timeout_s, on_progress)
             results.update({name: _failed_write(name, pending[name], None, error) for name, error in errors.items()})
             results.update({plan.resolved.requested: self._result(plan, answers) for plan in plans})
@@ -312,27 +315,27 @@ class ParameterWriter:
 
     def _plan_writes(
         self,
-        answers: Mapping[str, ResolvedParameter | AerokitError],
+        resolved: Mapping[str, ResolvedParameter | AerokitError],
         values: Mapping[str, int | float],
         *,
-        is_first: bool,
+        is_first_round: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
         """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
         plans: list[_PlannedWrite] = []
         first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
         errors: dict[str, AerokitError] = {}
-        for name, answer in answers.items():
-            if not isinstance(answer, ResolvedParameter):
-                errors[name] = answer
+        for name, result in resolved.items():
+            if not isinstance(result, ResolvedParameter):
+                errors[name] = result
                 continue
             try:
-                plan = _plan_write(answer, values[name])
+                plan = _plan_write(result, values[name])
                 # Two requested names may mean the same parameter.
                 first_plan = first_plans.setdefault(plan.to_send.name, plan)
                 _check_same_value(plan, first_plan)
                 plans.append(plan)
             except InvalidArgument as error:
-                if is_first:
+                if is_first_round:
                     raise
                 errors[name] = error
         return plans, errors
