@@ -210,6 +210,39 @@ class Motion:
         return (self.north, self.east, self.down)
 
     @property
+    def velocity(self) -> Ned:
+        return (self.velocity_north, self.velocity_east, self.velocity_down)
+
+    @property
+    def acceleration(self) -> Ned:
+        return (self.acceleration_north, self.acceleration_east, self.acceleration_down)
+
+    @property
+    def angles(self) -> tuple[float, float, float]:
+        """Roll, pitch and yaw."""
+        return (self.roll, self.pitch, self.yaw)
+
+    @property
+    def angular_rates(self) -> tuple[float, float, float]:
+        """Rates of change of roll, pitch and yaw, in radians per second."""
+        return (self.roll_rate, self.pitch_rate, self.yaw_rate)
+
+    @property
+    def course(self) -> float:
+        """Direction of the movement over ground, in radians from north."""
+        return math.atan2(self.velocity_east, self.velocity_north)
+
+    def distance_to(self, place: Ned) -> float:
+        """Return the horizontal distance to a place."""
+        north, east, _ = place
+        return math.hypot(north - self.north, east - self.east)
+
+    def bearing_to(self, place: Ned) -> float:
+        """Return the direction of a place, in radians from north."""
+        north, east, _ = place
+        return math.atan2(east - self.east, north - self.north)
+
+    @property
     def stopping_place(self) -> Ned:
         """The place ahead at which :meth:`seek_position` stops the vehicle without flying back."""
         speed, deceleration = self.ground_speed_m_s, BRAKING_SHARE * self.limits.acceleration_m_s2

@@ -121,7 +121,7 @@ class FixedWing(Motion):
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         was_on_ground = self.is_on_ground
-        velocity_before = (self.velocity_north, self.velocity_east, self.velocity_down)
+        velocity_before = self.velocity
         if was_on_ground and not self._lifts_off(powered=powered):
             self._taxi(dt, powered=powered)
         else:
@@ -355,7 +355,7 @@ class UnderwaterMotion(Motion):
 
     @property
     def is_still(self) -> bool:
-        speed = math.hypot(self.velocity_north, self.velocity_east, self.velocity_down)
+        speed = math.hypot(*self.velocity)
         return self.is_at_surface and speed < 0.01
 
     @property

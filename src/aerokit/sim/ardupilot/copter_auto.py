@@ -18,7 +18,7 @@ from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
 from aerokit.sim.ardupilot.host import RC_THROTTLE
-from aerokit.sim.ardupilot.mission_run import MissionCommand, MissionMode, horizontal_distance, place_of, set_home_from
+from aerokit.sim.ardupilot.mission_run import MissionCommand, MissionMode, place_of, set_home_from
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
@@ -331,7 +331,7 @@ class CopterAuto(MissionMode):
         if command == Cmd.CONDITION_DELAY:
             return now - self._condition_started_at > max(0.0, item.param1)
         if command == Cmd.CONDITION_DISTANCE:
-            return horizontal_distance(self.vehicle, self.destination) < max(0.0, item.param1)
+            return self.distance_to_destination < max(0.0, item.param1)
         if command == Cmd.CONDITION_YAW:
             return self.vehicle.yaw.turn_to_last_heading(_HEADING_REACHED_RAD)
         self.warn_if_unknown(item)

@@ -99,7 +99,7 @@ class AutoYaw:
     def _look_ahead(self) -> None:
         motion = self._copter.motion
         if motion.ground_speed_m_s > _MIN_LOOK_AHEAD_M_S:
-            motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
+            motion.face(motion.course)
 
     def _go_to_heading(self) -> None:
         motion = self._copter.motion
@@ -344,11 +344,10 @@ class CopterRtl(CopterModeBase):
         home = copter.navigation.home or (0.0, 0.0, copter.motion.ground_down)
         _, _, home_down = home
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
-        north, east, down = self._place
-        distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
+        _, _, down = self._place
         # The copter returns at the return altitude or at the altitude of `_place`, whichever is higher. `min` selects
         # the higher one, because a smaller down coordinate is higher.
-        self._return_down = min(down, home_down - self._return_altitude(distance))
+        self._return_down = min(down, home_down - self._return_altitude(copter.motion.distance_to(self._place)))
         copter.yaw.apply_default(returning=True)
         return True
 

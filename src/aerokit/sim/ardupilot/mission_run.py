@@ -6,7 +6,6 @@ that follows them. The mode that flies the mission starts commands and checks th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -83,6 +82,11 @@ class MissionMode(ArduPilotMode):
             self.on_mission_started()
 
     def on_mission_started(self) -> None: ...
+
+    @property
+    def distance_to_destination(self) -> float:
+        """Horizontal distance in metres; 0 without a destination."""
+        return 0.0 if self.destination is None else self.vehicle.motion.distance_to(self.destination)
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
         """Return True as soon as the command is complete. Called at every tick."""
@@ -373,14 +377,6 @@ class MissionRun:
             total = "unlimited" if times == _UNLIMITED else str(times)
             self._vehicle.info(f"Mission: {index} Jump {jumps_done + 1}/{total}")
         return True
-
-
-def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
-    """Return the horizontal distance in metres, or 0 without a place."""
-    if place is None:
-        return 0.0
-    north, east, _ = place
-    return math.hypot(north - vehicle.motion.north, east - vehicle.motion.east)
 
 
 def place_of(vehicle: ArduPilotHost, item: MissionItem, current: Ned) -> Ned:

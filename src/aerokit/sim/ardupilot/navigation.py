@@ -231,8 +231,7 @@ class ArduPilotNavigation:
 
 def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
     """Return the place where RTL ends: the nearest allowed rally point at its own height, or home."""
-    current = (vehicle.motion.north, vehicle.motion.east)
-    parameters = vehicle.parameters
+    motion, parameters = vehicle.motion, vehicle.parameters
     points = (
         vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         for item in vehicle.missions.items(MavMissionType.RALLY)
@@ -240,12 +239,12 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
     places = [point for point in points if point is not None and is_allowed(point)]
     if not places:
         return home
-    nearest = min(places, key=lambda place: math.dist(place[:2], current))
-    distance = math.dist(nearest[:2], current)
+    nearest = min(places, key=motion.distance_to)
+    distance = motion.distance_to(nearest)
     limit = parameters["RALLY_LIMIT_KM"] * 1000.0
     if limit > 0 and distance > limit:
         return home
-    if parameters["RALLY_INCL_HOME"] and distance >= math.dist(home[:2], current):
+    if parameters["RALLY_INCL_HOME"] and distance >= motion.distance_to(home):
         return home
     return nearest
 

@@ -16,7 +16,7 @@ from aerokit.mavlink.enums import HeadingType, MavFrame, MavResult, MavSeverity,
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance
+from aerokit.sim.ardupilot.mission_run import MissionMode
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, to_int
@@ -113,7 +113,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     @property
     def _is_on_circle(self) -> bool:
         radius = abs(self.radius or self.vehicle.parameters["WP_LOITER_RAD"])
-        return horizontal_distance(self.vehicle, self._place) < _ON_CIRCLE_SHARE * radius
+        return self.distance_to_destination < _ON_CIRCLE_SHARE * radius
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
         if self.vehicle.mode is not self or not self.vehicle.is_armed or not self._is_done(index, item):
@@ -170,7 +170,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         wing = self.vehicle.wing
         north, east, _ = self._place
         start_north, start_east, _ = self._leg_start
-        distance = horizontal_distance(self.vehicle, self._place)
+        distance = self.distance_to_destination
         if distance <= self.vehicle.parameters["WP_RADIUS"]:
             self.vehicle.info(f"Reached waypoint #{index} dist {int(distance)}m")
             return True

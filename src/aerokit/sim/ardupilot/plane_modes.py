@@ -108,9 +108,8 @@ class PlaneLanding:
 
     def _fly_to_start(self, start: Ned) -> None:
         wing = self._plane.wing
-        north, east, down = start
-        distance = math.hypot(north - wing.north, east - wing.east)
-        if distance < _JOINED_M and abs(wing.down - down) < _JOINED_M / 4:
+        _, _, down = start
+        if wing.distance_to(start) < _JOINED_M and abs(wing.down - down) < _JOINED_M / 4:
             self._approach_start = wing.place
             self._fly_to_first = None
             return
@@ -164,9 +163,7 @@ class PlaneLanding:
             plane.info("Auto disarmed")
             if not self._is_distance_reported:
                 self._is_distance_reported = True
-                north, east, _ = self.point
-                distance = math.hypot(north - wing.north, east - wing.east)
-                plane.info(f"Distance from LAND point={distance:.2f}m")
+                plane.info(f"Distance from LAND point={wing.distance_to(self.point):.2f}m")
 
 
 _MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
@@ -255,7 +252,7 @@ class PlaneCruise(PlaneAltitudeMode):
             super().steer(climb)
             return
         if self._course is None:
-            self._course = math.atan2(wing.velocity_east, wing.velocity_north)  # Hold the present course over ground.
+            self._course = wing.course  # Hold the present course over ground.
         wing.head(self._course, self.vehicle.cruise_m_s, climb)
 
 

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.sim.ardupilot.host import RC_ROLL, RC_THROTTLE, ArduPilotMode, variant
-from aerokit.sim.ardupilot.mission_run import horizontal_distance
 from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.motion import Ned, wrap_pi
@@ -44,10 +43,8 @@ class RoverHost(RoverSubVehicle):
     def has_arrived(self, place: Ned) -> bool:
         """Return True if the rover has reached, or just passed, a place at which it should stop."""
         motion = self.motion
-        place_north, place_east, _ = place
-        north, east = place_north - motion.north, place_east - motion.east
-        distance = math.hypot(north, east)
-        bearing_from_nose = wrap_pi(math.atan2(east, north) - motion.yaw)
+        distance = motion.distance_to(place)
+        bearing_from_nose = wrap_pi(motion.bearing_to(place) - motion.yaw)
         is_behind = abs(bearing_from_nose) > math.pi / 2
         is_moving = motion.ground_speed_m_s > _STANDING_M_S
         has_just_passed = is_behind and is_moving and distance <= self.parameters["WP_RADIUS"] / 2.0
@@ -55,7 +52,7 @@ class RoverHost(RoverSubVehicle):
 
     def has_passed(self, place: Ned) -> bool:
         """Return True within WP_RADIUS of a place that the vehicle passes without a stop."""
-        return horizontal_distance(self, place) <= self.parameters["WP_RADIUS"]
+        return self.motion.distance_to(place) <= self.parameters["WP_RADIUS"]
 
 
 class _Mode(ArduPilotMode):

@@ -17,7 +17,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, place_of, set_home_from
+from aerokit.sim.ardupilot.mission_run import MissionMode, place_of, set_home_from
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, PositionTarget, ReceivedCommand, Setpoint, is_finite, rotated
@@ -267,7 +267,7 @@ class RoverSubAuto(MissionMode):
         if command in (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY):
             return now >= self._wait_until
         if command == Cmd.CONDITION_DISTANCE:
-            return horizontal_distance(self.vehicle, self._place) < item.param1
+            return self.distance_to_destination < item.param1
         self.warn_if_unknown(item)
         return True
 

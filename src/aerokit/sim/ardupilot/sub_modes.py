@@ -47,9 +47,9 @@ class SubHost(RoverSubVehicle):
         north, east, down = self._below_surface(place)
         max_climb = parameters["WPNAV_SPEED_UP"] / 100.0
         max_descent = parameters["WPNAV_SPEED_DN"] / 100.0
-        distance = math.hypot(north - motion.north, east - motion.east)
+        distance = motion.distance_to(place)
         if looks_ahead and distance > _MIN_LOOK_AHEAD_M:
-            motion.face(math.atan2(east - motion.east, north - motion.north))
+            motion.face(motion.bearing_to(place))
         depth_difference = abs(down - motion.down)
         # The longer of the two distances is covered at `speed`, the shorter one more slowly, so that the path is
         # straight. The minimum of 1e-3 avoids a division by zero.

@@ -18,37 +18,25 @@ from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.copter_guided import CopterGuided
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-from aerokit.sim.motion import GRAVITY_M_S2, Motion, Ned, centidegrees, quaternion_from_euler
+from aerokit.sim.motion import GRAVITY_M_S2, centidegrees, quaternion_from_euler
 
 Three = tuple[int, int, int]
 
 
-def _angles(motion: Motion) -> tuple[float, float, float]:
-    return (motion.roll, motion.pitch, motion.yaw)
-
-
-def _angular_rates(motion: Motion) -> tuple[float, float, float]:
-    return (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
-
-
-def _velocity(motion: Motion) -> Ned:
-    return (motion.velocity_north, motion.velocity_east, motion.velocity_down)
-
-
 def _attitude(vehicle: ArduPilotVehicle) -> m.Attitude:
-    return m.Attitude(vehicle.time_boot_ms, *_angles(vehicle.motion), *_angular_rates(vehicle.motion))
+    return m.Attitude(vehicle.time_boot_ms, *vehicle.motion.angles, *vehicle.motion.angular_rates)
 
 
 def _attitude_quaternion(vehicle: ArduPilotVehicle) -> m.AttitudeQuaternion | None:
     if not vehicle.navigation.has_attitude:
         return None
-    quaternion = quaternion_from_euler(*_angles(vehicle.motion))
-    return m.AttitudeQuaternion(vehicle.time_boot_ms, *quaternion, *_angular_rates(vehicle.motion))
+    quaternion = quaternion_from_euler(*vehicle.motion.angles)
+    return m.AttitudeQuaternion(vehicle.time_boot_ms, *quaternion, *vehicle.motion.angular_rates)
 
 
 def _attitude_target(vehicle: ArduPilotVehicle) -> m.AttitudeTarget:
     motion = vehicle.motion
-    quaternion = quaternion_from_euler(*_angles(motion))
+    quaternion = quaternion_from_euler(*motion.angles)
     return m.AttitudeTarget(
         time_boot_ms=vehicle.time_boot_ms, type_mask=0, q=quaternion, body_roll_rate=0.0, body_pitch_rate=0.0,
         body_yaw_rate=motion.yaw_rate, thrust=vehicle.motors.throttle,
@@ -65,8 +53,8 @@ def _ahrs(vehicle: ArduPilotVehicle) -> m.Ahrs:
 def _ahrs2(vehicle: ArduPilotVehicle) -> m.Ahrs2:
     place = vehicle.navigation.position
     if place is None:
-        return m.Ahrs2(*_angles(vehicle.motion), altitude=0.0, lat=0, lng=0)
-    return m.Ahrs2(*_angles(vehicle.motion), place.altitude_m, place.latitude_e7, place.longitude_e7)
+        return m.Ahrs2(*vehicle.motion.angles, altitude=0.0, lat=0, lng=0)
+    return m.Ahrs2(*vehicle.motion.angles, place.altitude_m, place.latitude_e7, place.longitude_e7)
 
 
 def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
@@ -74,7 +62,7 @@ def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
     place = vehicle.navigation.frame.to_global(*motion.place)
     gravity = (0.0, 0.0, -GRAVITY_M_S2)
     position = (place.latitude_e7, place.longitude_e7)
-    return m.Simstate(*_angles(motion), *gravity, *_angular_rates(motion), *position)
+    return m.Simstate(*motion.angles, *gravity, *motion.angular_rates, *position)
 
 
 def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
@@ -104,7 +92,7 @@ def _magnetic_field(vehicle: ArduPilotVehicle) -> Three:
 
 def _imu(vehicle: ArduPilotVehicle) -> tuple[int, int, int, int, int, int, int, int, int]:
     """Return acceleration (milli-g), turn rates (mrad/s) and magnetic field (milligauss)."""
-    roll, pitch, yaw = (_int16(rate * 1000) for rate in _angular_rates(vehicle.motion))
+    roll, pitch, yaw = (_int16(rate * 1000) for rate in vehicle.motion.angular_rates)
     return (*_acceleration(vehicle), roll, pitch, yaw, *_magnetic_field(vehicle))
 
 
@@ -118,7 +106,7 @@ def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
     # The firmware multiplies milligauss by 1000, although the fields are in gauss (GCS_Common.cpp).
     north, east, down = (value * 1000.0 for value in _magnetic_field(vehicle))
     altitude = vehicle.navigation.frame.origin.altitude_m - motion.down
-    sensors = (x, y, z, *_angular_rates(motion), north, east, down, _pressure_hpa(vehicle))
+    sensors = (x, y, z, *motion.angular_rates, north, east, down, _pressure_hpa(vehicle))
     all_fields = 8191
     return m.HighresImu(
         vehicle.time_boot_us, *sensors, diff_pressure=0.0, pressure_alt=altitude, temperature=28.0,
@@ -167,7 +155,7 @@ def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
             time_boot_ms=time, lat=0, lon=0, alt=0, relative_alt=relative, vx=0, vy=0, vz=0, hdg=heading
         )
     altitude = round(place.altitude_m * 1000)
-    north, east, down = (round(speed * 100) for speed in _velocity(motion))
+    north, east, down = (round(speed * 100) for speed in motion.velocity)
     return m.GlobalPositionInt(
         time, lat=place.latitude_e7, lon=place.longitude_e7, alt=altitude, relative_alt=relative, vx=north, vy=east,
         vz=down, hdg=heading,
@@ -178,7 +166,7 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.has_position:
         return None
-    return m.LocalPositionNed(vehicle.time_boot_ms, *nav.local(motion.place), *_velocity(motion))
+    return m.LocalPositionNed(vehicle.time_boot_ms, *nav.local(motion.place), *motion.velocity)
 
 
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
@@ -192,7 +180,7 @@ def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
     return m.GpsRawInt(
         time_usec=vehicle.time_boot_us, fix_type=nav.fix_type, lat=place.latitude_e7, lon=place.longitude_e7,
         alt=altitude, eph=121, epv=200, vel=round(motion.ground_speed_m_s * 100),
-        cog=centidegrees(math.atan2(motion.velocity_east, motion.velocity_north)), satellites_visible=10,
+        cog=centidegrees(motion.course), satellites_visible=10,
         alt_ellipsoid=altitude, h_acc=300, v_acc=300,
     )  # fmt: skip
 
@@ -271,13 +259,12 @@ def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
     if not _is_navigating(vehicle):
         return None
     motion, target = vehicle.motion, vehicle.mode.destination
-    roll, pitch, yaw = map(math.degrees, _angles(motion))
+    roll, pitch, yaw = map(math.degrees, motion.angles)
     bearing, distance, altitude_error = 0, 0, 0.0
     if target is not None:
-        target_north, target_east, target_down = target
-        north, east = target_north - motion.north, target_east - motion.east
-        bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360  # Rounding may give 360, which is 0.
-        distance = min(65535, int(math.hypot(north, east)))
+        _, _, target_down = target
+        bearing = round(math.degrees(motion.bearing_to(target)) % 360.0) % 360  # Rounding may give 360, which is 0.
+        distance = min(65535, int(motion.distance_to(target)))
         altitude_error = motion.down - target_down
     return m.NavControllerOutput(
         nav_roll=roll, nav_pitch=pitch, nav_bearing=round(yaw), target_bearing=bearing, wp_dist=distance,

@@ -43,7 +43,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
     motion = vehicle.motion  # type: ignore[attr-defined]
     # Only simulated autopilots have `altitude_m`, the height above home. For other vehicles, the origin is the home.
     height_m = getattr(vehicle, "altitude_m", -motion.down)
-    return Pose(place, height_m, motion.roll, motion.pitch, motion.yaw)
+    return Pose(place, height_m, *motion.angles)
 
 
 def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpServer[FileTree]:

@@ -82,8 +82,7 @@ def return_destination(px4: Px4Host) -> Ned:
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
         return px4.home
     candidates = rally_points if rtl_type == _RALLY_FIRST else [px4.home, *rally_points]
-    current = (px4.motion.north, px4.motion.east)
-    return min(candidates, key=lambda place: math.dist(current, place[:2]))
+    return min(candidates, key=px4.motion.distance_to)
 
 
 def _place(px4: Px4Host, item: MissionItem) -> Ned:
@@ -221,7 +220,7 @@ class Px4Flight:
         if self.heading is not None:
             motion.face(self.heading)
         elif motion.ground_speed_m_s > _MIN_SPEED_TO_TURN_M_S:
-            motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
+            motion.face(motion.course)
 
     def descend(self) -> None:
         self._vehicle.motion.seek_velocity(0.0, 0.0, self.descent_speed_m_s)
@@ -238,10 +237,9 @@ class Px4Flight:
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.place
-        destination_north, destination_east, destination_down = self.destination
+        _, _, destination_down = self.destination
         current_height = destination_down - down
-        distance = math.hypot(north - destination_north, east - destination_east)
-        is_near = distance < vehicle.parameters["RTL_MIN_DIST"]
+        is_near = vehicle.motion.distance_to(self.destination) < vehicle.parameters["RTL_MIN_DIST"]
         return_height = vehicle.parameters["RTL_DESCEND_ALT" if is_near else "RTL_RETURN_ALT"]
         # The return begins with a climb at the present place, and never with a descent.
         height = max(return_height, current_height)

@@ -355,9 +355,9 @@ class Px4Mission:
     def _is_at_target(self, item: MissionItem) -> bool:
         if item.command == Cmd.NAV_DELAY:
             return True
-        motion = self._px4.motion
-        north, east, down = self._px4.flight.target
-        is_near = math.hypot(north - motion.north, east - motion.east) <= self._acceptance_radius_m(item)
+        motion, target = self._px4.motion, self._px4.flight.target
+        _, _, down = target
+        is_near = motion.distance_to(target) <= self._acceptance_radius_m(item)
         return is_near and abs(down - motion.down) <= self._height_tolerance_m
 
     def _acceptance_radius_m(self, item: MissionItem) -> float:

@@ -122,7 +122,7 @@ class Px4Offboard:
         motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
             if self._attitude is None or self._body_rates is None:  # Rates start from the present attitude.
-                self._attitude = (motion.roll, motion.pitch, motion.yaw)
+                self._attitude = motion.angles
             self._body_rates = (target.body_roll_rate, target.body_pitch_rate, target.body_yaw_rate)
         elif all(map(math.isfinite, target.q)):
             self._attitude = euler_from_quaternion(*target.q)
@@ -137,7 +137,7 @@ class Px4Offboard:
             return
         motion = self._vehicle.motion
         # Of the controls, only the thrust is simulated. The vehicle keeps its present attitude.
-        self._attitude = (motion.roll, motion.pitch, motion.yaw)
+        self._attitude = motion.angles
         self._body_rates = None
         if target.group_mlx == _FLIGHT_CONTROL_GROUP:
             self._thrust = target.controls[_THRUST_CONTROL]

@@ -147,24 +147,18 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
 
 
 def _attitude(px4: Px4Vehicle) -> m.Attitude:
-    motion = px4.motion
-    return m.Attitude(
-        px4.time_boot_ms, motion.roll, motion.pitch, motion.yaw, motion.roll_rate, motion.pitch_rate, motion.yaw_rate,
-    )  # fmt: skip
+    return m.Attitude(px4.time_boot_ms, *px4.motion.angles, *px4.motion.angular_rates)
 
 
 def _attitude_quaternion(px4: Px4Vehicle) -> m.AttitudeQuaternion:
-    motion = px4.motion
-    quaternion = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.AttitudeQuaternion(px4.time_boot_ms, *quaternion, motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
+    quaternion = quaternion_from_euler(*px4.motion.angles)
+    return m.AttitudeQuaternion(px4.time_boot_ms, *quaternion, *px4.motion.angular_rates)
 
 
 def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
-    motion = px4.motion
-    quaternion = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
     return m.AttitudeTarget(
-        px4.time_boot_ms, type_mask=0, q=quaternion, body_roll_rate=0.0, body_pitch_rate=0.0,
-        body_yaw_rate=motion.yaw_rate, thrust=px4.throttle,
+        px4.time_boot_ms, type_mask=0, q=quaternion_from_euler(*px4.motion.angles), body_roll_rate=0.0,
+        body_pitch_rate=0.0, body_yaw_rate=px4.motion.yaw_rate, thrust=px4.throttle,
     )  # fmt: skip
 
 
@@ -174,18 +168,16 @@ def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
     if not px4.has_position and not px4.is_armed:
         return None
     motion = px4.motion
-    place = px4.frame.to_global(motion.north, motion.east, motion.down)
+    place = px4.frame.to_global(*motion.place)
+    north, east, down = (round(speed * 100) for speed in motion.velocity)
     return m.GlobalPositionInt(
         px4.time_boot_ms, lat=place.latitude_e7, lon=place.longitude_e7, alt=round(place.altitude_m * 1000),
-        relative_alt=round(px4.altitude_m * 1000), vx=round(motion.velocity_north * 100),
-        vy=round(motion.velocity_east * 100), vz=round(motion.velocity_down * 100), hdg=centidegrees(motion.yaw),
+        relative_alt=round(px4.altitude_m * 1000), vx=north, vy=east, vz=down, hdg=centidegrees(motion.yaw),
     )  # fmt: skip
 
 
 def _local_position(px4: Px4Vehicle) -> m.LocalPositionNed:
-    motion = px4.motion
-    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
-    return m.LocalPositionNed(px4.time_boot_ms, motion.north, motion.east, motion.down, *velocity)
+    return m.LocalPositionNed(px4.time_boot_ms, *px4.motion.place, *px4.motion.velocity)
 
 
 def _altitude(px4: Px4Vehicle) -> m.Altitude:
@@ -215,13 +207,13 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
             time_usec=0, fix_type=GpsFixType.NO_FIX, lat=0, lon=0, alt=0, eph=worst, epv=worst, vel=unknown,
             cog=unknown, satellites_visible=0,
         )  # fmt: skip
-    place = px4.frame.to_global(motion.north, motion.east, motion.down)
+    place = px4.frame.to_global(*motion.place)
     altitude = round(place.altitude_m * 1000)
-    course = centidegrees(math.atan2(motion.velocity_east, motion.velocity_north))
     return m.GpsRawInt(
         px4.time_boot_us, GpsFixType.RTK_FIXED if px4.corrections.is_recent else GpsFixType.TYPE_3D_FIX,
         place.latitude_e7, place.longitude_e7, altitude, eph=70, epv=110, vel=round(motion.ground_speed_m_s * 100),
-        cog=course, satellites_visible=10, alt_ellipsoid=altitude, h_acc=900, v_acc=1780, vel_acc=400,
+        cog=centidegrees(motion.course), satellites_visible=10, alt_ellipsoid=altitude, h_acc=900, v_acc=1780,
+        vel_acc=400,
     )  # fmt: skip
 
 
@@ -261,13 +253,11 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
             px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw=yaw, yaw_rate=0.0
         )
     # Apart from the position, the simulation sends the present values as the targets.
-    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
-    acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
+    vectors = (*px4.flight.target, *motion.velocity, *motion.acceleration)
     nothing_ignored = 0
     return m.PositionTargetLocalNed(
-        px4.time_boot_ms, MavFrame.LOCAL_NED, nothing_ignored, *px4.flight.target, *velocity, *acceleration, yaw=yaw,
-        yaw_rate=motion.yaw_rate,
-    )  # fmt: skip
+        px4.time_boot_ms, MavFrame.LOCAL_NED, nothing_ignored, *vectors, yaw=yaw, yaw_rate=motion.yaw_rate
+    )
 
 
 def _servo_output(px4: Px4Vehicle) -> m.ServoOutputRaw:

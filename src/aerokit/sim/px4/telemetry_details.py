@@ -74,8 +74,8 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
     if not px4.has_position:
         return None
     motion = px4.motion
-    place = px4.frame.to_global(motion.north, motion.east, motion.down)
-    course_deg = math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0
+    place = px4.frame.to_global(*motion.place)
+    course_deg = math.degrees(motion.course) % 360.0
     direction = 100 * (round(course_deg) % 360)  # Hundredths of a degree. Rounding may give 360 degrees, which is 0.
     unknown_time = 65535.0
     return m.OpenDroneIdLocation(
@@ -171,20 +171,17 @@ def _magnetic_field_gauss(px4: Px4Vehicle) -> tuple[float, float, float]:
 
 
 def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
-    motion, height = px4.motion, _height(px4)
-    rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
-    pressure = _pressure_hpa(px4)
+    sensors = (*_measured_acceleration(px4), *px4.motion.angular_rates, *_magnetic_field_gauss(px4))
     return m.HighresImu(
-        px4.time_boot_us, *_measured_acceleration(px4), *rates, *_magnetic_field_gauss(px4), abs_pressure=pressure,
-        diff_pressure=0.0, pressure_alt=height, temperature=_SEA_LEVEL_C, fields_updated=_IMU_FIELDS,
+        px4.time_boot_us, *sensors, abs_pressure=_pressure_hpa(px4), diff_pressure=0.0, pressure_alt=_height(px4),
+        temperature=_SEA_LEVEL_C, fields_updated=_IMU_FIELDS,
     )  # fmt: skip
 
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
-    motion = px4.motion
     # The fields of SCALED_IMU are in milli-g, mrad/s and milligauss.
     force_x, force_y, force_z = (round(axis / GRAVITY_M_S2 * 1000) for axis in _measured_acceleration(px4))
-    rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (motion.roll_rate, motion.pitch_rate, motion.yaw_rate))
+    rate_x, rate_y, rate_z = (round(rate * 1000) for rate in px4.motion.angular_rates)
     field_x, field_y, field_z = (round(axis * 1000) for axis in _magnetic_field_gauss(px4))
     time = px4.time_boot_ms
     return m.ScaledImu(
@@ -194,13 +191,10 @@ def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
 
 def _odometry(px4: Px4Vehicle) -> m.Odometry:
     motion = px4.motion
-    quaternion = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
-    rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
+    pose = (*motion.place, quaternion_from_euler(*motion.angles))
     return m.Odometry(
-        px4.time_boot_us, MavFrame.LOCAL_NED, MavFrame.LOCAL_NED, motion.north, motion.east, motion.down, quaternion,
-        *velocity, *rates, _COVARIANCE, _COVARIANCE, reset_counter=0, estimator_type=MavEstimatorType.AUTOPILOT,
-        quality=0,
+        px4.time_boot_us, MavFrame.LOCAL_NED, MavFrame.LOCAL_NED, *pose, *motion.velocity, *motion.angular_rates,
+        _COVARIANCE, _COVARIANCE, reset_counter=0, estimator_type=MavEstimatorType.AUTOPILOT, quality=0,
     )  # fmt: skip
 
 
@@ -231,20 +225,19 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
         return None
     place, motion = px4.frame.to_global(*px4.flight.target), px4.motion
     # The simulation has no target for the velocity and the yaw, so it sends the present values.
-    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     yaw_and_rate = (motion.yaw, motion.yaw_rate)
-    no_mask, no_acceleration = 0, (0.0, 0.0, 0.0)
+    nothing_ignored, no_acceleration = 0, (0.0, 0.0, 0.0)
     return m.PositionTargetGlobalInt(
-        px4.time_boot_ms, MavFrame.GLOBAL_INT, no_mask, *place, *velocity, *no_acceleration, *yaw_and_rate
-    )
+        px4.time_boot_ms, MavFrame.GLOBAL_INT, nothing_ignored, *place, *motion.velocity, *no_acceleration,
+        *yaw_and_rate,
+    )  # fmt: skip
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
     return_s = _UNKNOWN_TIME
     if not px4.is_landed:
         height = max(px4.parameters["RTL_RETURN_ALT"], px4.altitude_m)
-        home_north, home_east, _ = px4.home
-        distance = math.hypot(px4.motion.north - home_north, px4.motion.east - home_east)
+        distance = px4.motion.distance_to(px4.home)
         climb_s = (height - px4.altitude_m) / _CLIMB_M_S
         descent_s = height / _DESCENT_M_S
         return_s = round(climb_s + distance / px4.flight.cruise_speed_m_s + descent_s)

@@ -185,12 +185,10 @@ class Px4PlaneFlight(Px4Flight):
             approach()
 
     def _glide(self) -> None:
-        motion = self._motion
-        target_north, target_east, _ = self.target
-        north, east = target_north - motion.north, target_east - motion.east
-        height = math.hypot(north, east) * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
+        motion, parameters = self._motion, self._plane.parameters
+        height = motion.distance_to(self.target) * math.tan(math.radians(parameters["FW_LND_ANG"]))
         climb = min(0.0, motion.climb_rate_to(motion.ground_down - height))
-        motion.head(math.atan2(east, north), self._plane.parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
+        motion.head(motion.bearing_to(self.target), parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
 
     def _return(self) -> None:
         motion, plane = self._motion, self._plane
@@ -218,9 +216,7 @@ class Px4PlaneFlight(Px4Flight):
             plane.info("RTL: land at destination")
 
     def _is_near(self) -> bool:
-        north, east, _ = self.target
-        distance = math.hypot(north - self._motion.north, east - self._motion.east)
-        return distance <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
+        return self._motion.distance_to(self.target) <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
 
 
 _TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
