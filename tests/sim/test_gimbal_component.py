@@ -60,6 +60,14 @@ def test_attitude_is_streamed() -> None:
     assert not client.all(m.GimbalDeviceAttitudeStatus)
 
 
+def test_fastest_stream_has_200_hz() -> None:
+    _, client = fitted()
+    client.ask(GIMBAL, MavCmd.SET_MESSAGE_INTERVAL, m.GimbalDeviceAttitudeStatus.ID, 1)
+    client.clear()
+    client.run(0.1)
+    assert len(client.all(m.GimbalDeviceAttitudeStatus)) == pytest.approx(20, abs=1)
+
+
 def test_commands_without_control_are_denied() -> None:
     gimbal, client = fitted()
     assert client.ask(GIMBAL, POINT, -30, 0, NAN, NAN) == DENIED

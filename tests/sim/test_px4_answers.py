@@ -305,6 +305,15 @@ def test_message_interval_reports_as_the_firmware() -> None:
     assert interval(client, m.StorageInformation.ID) == 0, "requested once"
 
 
+def test_fastest_stream_is_sent_once_per_loop_of_px4() -> None:
+    _, client = ready()
+    assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.HighresImu.ID, 1) == MavResult.ACCEPTED
+    client.clear()
+    client.run(0.15)
+    assert len(client.all(m.HighresImu)) == pytest.approx(100, abs=1)
+    assert interval(client, m.HighresImu.ID) == 1
+
+
 REQUESTED = (
     m.ScaledImu,
     m.ScaledPressure,

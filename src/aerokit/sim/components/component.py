@@ -60,6 +60,7 @@ def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpSer
 
 
 _HEARTBEAT_INTERVAL_S = 1.0
+_MIN_STREAM_INTERVAL_S = 0.005  # as for the components of aerokit.onboard
 _MAVLINK_VERSION = 3
 
 
@@ -85,7 +86,7 @@ class SimulatedComponent:
         self._booted_at = math.nan
         self._at_power_on: list[Callable[[], None]] = []
         self._commands: dict[int, CommandHandler] = {}
-        self._streams: MessageStreams = MessageStreams(self)
+        self._streams: MessageStreams = MessageStreams(self, min_interval_s=_MIN_STREAM_INTERVAL_S)
 
     def commands(self) -> dict[int, CommandHandler]:
         """Return the handlers of the component's own commands by MAV_CMD."""

@@ -152,6 +152,7 @@ _SIMULATION_RATES_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Stat
 _ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, m.CurrentEventSequence.ID: 0.3}
 
 _OFF, _ON_CHANGE = -1, 0
+_MIN_INTERVAL_S = 0.0015  # PX4 sends a stream at most once in each loop (mavlink_main.h, MAVLINK_MIN_INTERVAL).
 
 
 class Px4StreamRates:
@@ -207,7 +208,8 @@ class Px4StreamRates:
         new_us = default_us if requested_us == 0 else max(_OFF, requested_us)
         self._intervals_us[channel][message_id] = new_us
         if self._is_built(message_id):
-            channel.streams.set_interval(message_id, max(0, new_us) / 1e6, now)  # 0 stops the stream.
+            interval_s = max(_MIN_INTERVAL_S, new_us / 1e6) if new_us > 0 else 0.0  # 0 stops the stream.
+            channel.streams.set_interval(message_id, interval_s, now)
         return MavResult.ACCEPTED
 
     def on_requested(self, channel: Channel, message_id: int) -> None:
