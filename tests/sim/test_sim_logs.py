@@ -72,6 +72,15 @@ def test_log_files_exist_until_erased(kind: str) -> None:
 
 
 @both
+def test_erasing_logs_removes_files_and_folders_of_clients(kind: str) -> None:
+    vehicle, client = vehicle_with(kind)
+    folder = "/APM/LOGS" if kind == "copter" else "/fs/microsd/log"
+    vehicle.files.put(f"{folder}/own/deep/file", b"1").put(f"{folder}/file", b"2")
+    client.send(m.LogErase(1, 1))
+    assert vehicle.files.entries(folder) == []
+
+
+@both
 def test_part_of_a_log_is_downloaded(kind: str) -> None:
     _, client = vehicle_with(kind)
     log_id = entries(client)[2].id

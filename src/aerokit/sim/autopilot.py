@@ -14,9 +14,12 @@ from aerokit.mavlink.messages import GpsRtcmData, SetupSigning
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey, timestamp_at
 from aerokit.protocols.rtcm import FRAGMENT_SIZE, MAX_FRAGMENTS
 from aerokit.protocols.servers.files import FileTree
+from aerokit.protocols.servers.ftp import SessionFtpServer
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
+from aerokit.sim.logs import LogServer
 from aerokit.sim.motion import Motion
+from aerokit.sim.parameter_server import ParameterServer
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
@@ -145,6 +148,34 @@ class ReceivedCorrections:
         self._received_at = self._vehicle.now
 
 
+# Sizes of three kinds of MAVLink 2 frames in bytes, without a signature.
+_PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
+
+
+class VehicleStorage:
+    """Files, and the protocol servers of parameters, files and logs. A subclass creates the servers of its firmware."""
+
+    parameters: ParameterServer
+    ftp: SessionFtpServer[FileTree]
+    logs: LogServer
+
+    def __init__(self) -> None:
+        self.files: FileTree = FileTree()
+
+    def limit_rates(self, link_bytes_per_s: float | None, *, parameters: float, files: float, logs: float) -> None:
+        """Limit each server to a share of the link's data rate. None does not limit them."""
+        if link_bytes_per_s is not None:
+            self.parameters.list_rate_hz = parameters * link_bytes_per_s / _PARAM_VALUE_FRAME
+            self.ftp.burst_interval_s = _FTP_FRAME / (files * link_bytes_per_s)
+            self.logs.rate_hz = logs * link_bytes_per_s / _LOG_DATA_FRAME
+            self.parameters.burst = self.ftp.burst = self.logs.burst = 1
+
+    def restart(self) -> None:
+        self.parameters.restart()
+        self.ftp.restart()
+        self.logs.restart()
+
+
 # The FIRMWARE_VERSION_TYPE for each suffix of a version text.
 _RELEASE_TYPES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "official": 255}
 
@@ -161,8 +192,8 @@ class SimulatedAutopilot(SimulatedVehicle):
     CAPABILITIES: ClassVar[int]
     """MAV_PROTOCOL_CAPABILITY flags."""
 
-    files: FileTree
-    """Files on the memory card and generated files, which survive a reboot."""
+    storage: VehicleStorage
+    """Protocol servers of files, logs and parameters."""
     signing: VehicleSigning
     """Message signing, whose key survives a reboot."""
     motion: Motion
@@ -186,6 +217,16 @@ class SimulatedAutopilot(SimulatedVehicle):
         self._unix_time_at_start = unix_time_at_boot
         self.signing = self.make_signing(signing_key, timestamp_at(unix_time_at_boot))
         self.corrections: ReceivedCorrections = ReceivedCorrections(self)
+
+    @property
+    def files(self) -> FileTree:
+        """Files on the memory card and generated files, which survive a reboot."""
+        return self.storage.files
+
+    @property
+    def ftp(self) -> SessionFtpServer[FileTree]:
+        """The file server."""
+        return self.storage.ftp
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> VehicleSigning:
         """Create the signing of this firmware, with a stored key and time stamp."""

@@ -11,17 +11,18 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import ClassVar
 
-from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import LogData, LogEntry, LogErase, LogRequestData, LogRequestEnd, LogRequestList
+from aerokit.mavlink.messages import LogData, LogErase, LogRequestData, LogRequestEnd, LogRequestList
+from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import SimulatedVehicle
 
 SAMPLE_LOG = b"aerokit simulator: sample log, contains no flight\n"
 """First bytes of each simulated log."""
-_BLOCK = 90
+BLOCK_SIZE = 90
+"""Maximum number of bytes in a LOG_DATA message."""
 
 
 @dataclass(frozen=True)
@@ -54,26 +55,21 @@ class SimulatedLog:
 class LogServer:
     """Sends lists and contents of logs at ``rate_hz`` messages per second, in groups of ``burst`` messages.
 
-    The server makes one transfer at a time. Subclasses implement what differs between autopilots. If the logs are also
-    files on the vehicle, ``erase_files`` and ``append_to_file`` keep these files equal to the logs.
+    The server makes one transfer at a time. Subclasses implement what differs between autopilots. Each log is also a
+    file in ``files``.
     """
 
+    FOLDER: ClassVar[str]
+    """Folder of the log files."""
     burst = 10
 
-    def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        logs: Sequence[SimulatedLog],
-        *,
-        rate_hz: float = 4000.0,
-        erase_files: Callable[[], None] = lambda: None,
-        append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
-    ) -> None:
+    def __init__(self, vehicle: SimulatedVehicle, logs: Sequence[SimulatedLog], files: FileTree) -> None:
         self.logs: list[SimulatedLog] = list(logs)
-        self.rate_hz = rate_hz
+        self.rate_hz: float = 4000.0
         self._vehicle = vehicle
-        self._erase_files = erase_files
-        self._append_to_file = append_to_file
+        self._files = files
+        for index, log in enumerate(logs):
+            files.put(self.path(index), log.make, size=log.size)
         # Functions that build the messages of the present transfer.
         self._outgoing: deque[Callable[[], Message]] = deque()
         self._channel: Channel | None = None  # where the present transfer is sent
@@ -85,6 +81,10 @@ class LogServer:
         vehicle.on(LogRequestData, self._on_data)
         vehicle.on(LogErase, self._on_erase)
         vehicle.on(LogRequestEnd, self._on_end)
+
+    def path(self, index: int) -> str:
+        """Return the path of the file with the log at this index."""
+        raise NotImplementedError
 
     @property
     def is_busy(self) -> bool:
@@ -105,7 +105,7 @@ class LogServer:
         self.restart()
         self.logs.clear()
         self._content_index = -1
-        self._erase_files()
+        self._files.clear_folder(self.FOLDER)
 
     def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
         self.restart()
@@ -121,14 +121,14 @@ class LogServer:
         """Extend the newest log by ``count`` bytes, and set its time to ``time_utc``."""
         old = self.logs[-1]
         self.logs[-1] = old.grown(count, time_utc)
-        self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[old.size :])
+        self._files.append(self.path(len(self.logs) - 1), self.logs[-1].make()[old.size :])
 
     def blocks(self, index: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
         """Return functions that create the LOG_DATA messages of a range."""
         data = self.content(index)
         end = min(len(data), offset + count)
         # A range without data has one empty block.
-        starts: Sequence[int] = range(offset, end, _BLOCK) if offset < end else [offset]
+        starts: Sequence[int] = range(offset, end, BLOCK_SIZE) if offset < end else [offset]
         return [partial(_log_data, data, log_id, start, end) for start in starts]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
@@ -147,88 +147,6 @@ class LogServer:
             self._vehicle.call_later(self.burst / self.rate_hz, lambda: self._send_next(transfer))
 
 
-class ArduPilotLogServer(LogServer):
-    """ArduPilot's log server. Log numbers start at 1, and requests are refused while the vehicle is armed.
-
-    A request during a transfer, or for an unknown log, gets no data.
-    """
-
-    def __init__(
-        self, vehicle: SimulatedVehicle, logs: Sequence[SimulatedLog], *, is_armed: Callable[[], bool], **options: Any
-    ) -> None:
-        super().__init__(vehicle, logs, **options)
-        self._is_armed = is_armed
-        self._has_warned = False
-
-    def _on_list(self, request: LogRequestList, channel: Channel) -> None:
-        if self._refuses():
-            return
-        if self.is_busy:
-            self._vehicle.info("Log download in progress")
-            return
-        first, last = max(1, request.start), min(len(self.logs), request.end)
-        if not self.logs:  # Without logs, answer with a single empty entry that has the number 0.
-            first = last = 0
-        numbers = range(first, last + 1)
-        self.transfer([partial(self._entry, number, last) for number in numbers], channel)
-
-    def _entry(self, number: int, last: int) -> LogEntry:
-        if number == 0:
-            return LogEntry(id=0, num_logs=0, last_log_num=0, time_utc=0, size=0)
-        log = self.logs[number - 1]
-        return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
-
-    def _on_data(self, request: LogRequestData, channel: Channel) -> None:
-        is_known = 1 <= request.id <= len(self.logs)
-        if self._refuses() or self.is_busy or not is_known:
-            return
-        self.transfer(self.blocks(request.id - 1, request.id, request.ofs, request.count), channel)
-
-    def _on_erase(self, request: LogErase, channel: Channel) -> None:
-        if not self._refuses():
-            super()._on_erase(request, channel)
-
-    def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
-        if not self._refuses():
-            super()._on_end(request, channel)
-
-    def _refuses(self) -> bool:
-        armed = self._is_armed()
-        if armed and not self._has_warned:
-            self._vehicle.send_text(MavSeverity.ERROR, "Disarm for log download")
-        self._has_warned = armed
-        return armed
-
-
-class Px4LogServer(LogServer):
-    """PX4's log server. Log numbers start at 0, and data is sent only after a list request.
-
-    All logs from ``start`` are listed, and ``end`` is only copied to ``last_log_num``. A new request replaces the
-    transfer. The last block is not cut to the requested size. Without logs, a list request is not answered.
-    """
-
-    _was_listed = False
-
-    def _on_list(self, request: LogRequestList, channel: Channel) -> None:
-        self._was_listed = True
-        count = len(self.logs)
-        last = count if request.end == 0xFFFF else request.end
-        numbers = range(request.start, count)
-        self.transfer([partial(self._entry, number, last) for number in numbers], channel)
-
-    def _entry(self, number: int, last: int) -> LogEntry:
-        log = self.logs[number]
-        return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
-
-    def _on_data(self, request: LogRequestData, channel: Channel) -> None:
-        is_available = self._was_listed and request.id < len(self.logs)
-        if not is_available or request.ofs >= self.logs[request.id].size:
-            self.restart()
-            return
-        whole_blocks = max(1, math.ceil(request.count / _BLOCK))
-        self.transfer(self.blocks(request.id, request.id, request.ofs, whole_blocks * _BLOCK), channel)
-
-
 def _log_data(data: bytes, log_id: int, start: int, end: int) -> LogData:
-    piece = data[start : min(end, start + _BLOCK)]
+    piece = data[start : min(end, start + BLOCK_SIZE)]
     return LogData(log_id, start, len(piece), piece)

@@ -328,6 +328,19 @@ class FileTree:
             raise FileFault(ENOTEMPTY)
         del folder[name]
 
+    def clear_folder(self, path: str) -> None:
+        """Remove all files and folders in a folder. Do nothing if there is no such folder."""
+        try:
+            entries = self.entries(path)
+        except FileFault:
+            return
+        for name, size in entries:
+            if size is None:
+                self.clear_folder(f"{path}/{name}")
+                self.remove_folder(f"{path}/{name}")
+            else:
+                self.remove_file(f"{path}/{name}")
+
     def _find(self, path: str) -> _File | _Folder:
         """Return the file or folder with this path. Raises FileFault if there is none."""
         node: _File | _Folder = self._root

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import ClassVar
 
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.messages import LogEntry, LogErase, LogRequestData, LogRequestEnd, LogRequestList
 from aerokit.mavlink.signing import ONE_MINUTE, SigningKey, timestamp_at
 from aerokit.protocols.servers.files import FileTree, TextMount
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.autopilot import VehicleSigning
-from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
+from aerokit.sim.autopilot import VehicleSigning, VehicleStorage
+from aerokit.sim.channel import Channel
+from aerokit.sim.logs import LogServer, SimulatedLog
 from aerokit.sim.missions import MissionMount
 from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
 from aerokit.sim.parameters import ParameterPackMount
 
-LOG_FOLDER = "/APM/LOGS"
 DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
 
 _SYSTEM_TEXTS = {
@@ -29,12 +31,65 @@ _SYSTEM_TEXTS = {
     "timers.txt": "TIMERV1\n",
 }
 
-# Sizes of three kinds of MAVLink 2 frames in bytes, without a signature.
-_PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
-_PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
+
+class ArduPilotLogServer(LogServer):
+    """ArduPilot's log server. Log numbers start at 1, and requests are refused while the vehicle is armed.
+
+    A request during a transfer, or for an unknown log, gets no data.
+    """
+
+    FOLDER: ClassVar[str] = "/APM/LOGS"
+
+    def __init__(self, vehicle: ArduPilotHost, logs: Sequence[SimulatedLog], files: FileTree) -> None:
+        super().__init__(vehicle, logs, files)
+        files.put(f"{self.FOLDER}/LASTLOG.TXT", f"{len(logs)}\r\n".encode())
+        self._ardupilot = vehicle
+        self._has_warned = False
+
+    def path(self, index: int) -> str:
+        return f"{self.FOLDER}/{index + 1:08}.BIN"
+
+    def _on_list(self, request: LogRequestList, channel: Channel) -> None:
+        if self._refuses():
+            return
+        if self.is_busy:
+            self._vehicle.info("Log download in progress")
+            return
+        first, last = max(1, request.start), min(len(self.logs), request.end)
+        if not self.logs:  # Without logs, answer with a single empty entry that has the number 0.
+            first = last = 0
+        numbers = range(first, last + 1)
+        self.transfer([partial(self._entry, number, last) for number in numbers], channel)
+
+    def _entry(self, number: int, last: int) -> LogEntry:
+        if number == 0:
+            return LogEntry(id=0, num_logs=0, last_log_num=0, time_utc=0, size=0)
+        log = self.logs[number - 1]
+        return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
+
+    def _on_data(self, request: LogRequestData, channel: Channel) -> None:
+        is_known = 1 <= request.id <= len(self.logs)
+        if self._refuses() or self.is_busy or not is_known:
+            return
+        self.transfer(self.blocks(request.id - 1, request.id, request.ofs, request.count), channel)
+
+    def _on_erase(self, request: LogErase, channel: Channel) -> None:
+        if not self._refuses():
+            super()._on_erase(request, channel)
+
+    def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
+        if not self._refuses():
+            super()._on_end(request, channel)
+
+    def _refuses(self) -> bool:
+        armed = self._ardupilot.is_armed
+        if armed and not self._has_warned:
+            self._vehicle.send_text(MavSeverity.ERROR, "Disarm for log download")
+        self._has_warned = armed
+        return armed
 
 
-class ArduPilotStorage:
+class ArduPilotStorage(VehicleStorage):
     """Protocol servers of files, logs and parameters.
 
     ``link_bytes_per_s`` is the data rate of a port without flow control. A parameter list uses 30 % of this rate, a
@@ -49,43 +104,18 @@ class ArduPilotStorage:
         parameter_errors: bool,
         link_bytes_per_s: float | None,
     ) -> None:
+        super().__init__()
         self._vehicle = vehicle
-        self.files: FileTree = FileTree()
-        self._put_logs(logs)
         self.files.mounts["@SYS"] = TextMount(_SYSTEM_TEXTS)
         self.files.mounts["@PARAM"] = ParameterPackMount(vehicle.parameters, self._apply)
         self.files.mounts["@MISSION"] = MissionMount(vehicle.missions)
         banner = vehicle.send_banner
-        self.parameters: ArduPilotParameterServer = ArduPilotParameterServer(
+        self.parameters = ArduPilotParameterServer(
             vehicle, vehicle.parameters, sends_errors=parameter_errors, send_banner=banner
         )
-        self.ftp: ArduPilotFtp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
-        self.logs: ArduPilotLogServer = ArduPilotLogServer(
-            vehicle,
-            logs,
-            is_armed=lambda: vehicle.is_armed,
-            erase_files=self._erase_logs,
-            append_to_file=lambda number, data: self.files.append(_log_path(number), data),
-        )
-        if link_bytes_per_s is not None:
-            self.parameters.list_rate_hz = _PARAMETERS_SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
-            self.ftp.burst_interval_s = _FTP_FRAME / (_BURST_SHARE * link_bytes_per_s)
-            self.logs.rate_hz = _LOG_SHARE * link_bytes_per_s / _LOG_DATA_FRAME
-            self.parameters.burst = self.logs.burst = 1
-
-    def restart(self) -> None:
-        self.parameters.restart()
-        self.ftp.restart()
-        self.logs.restart()
-
-    def _put_logs(self, logs: Sequence[SimulatedLog]) -> None:
-        for number, log in enumerate(logs):
-            self.files.put(_log_path(number), log.make, size=log.size)
-        self.files.put(f"{LOG_FOLDER}/LASTLOG.TXT", f"{len(logs)}\r\n".encode())
-
-    def _erase_logs(self) -> None:
-        for name, _ in self.files.entries(LOG_FOLDER):
-            self.files.remove_file(f"{LOG_FOLDER}/{name}")
+        self.ftp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
+        self.logs = ArduPilotLogServer(vehicle, logs, self.files)
+        self.limit_rates(link_bytes_per_s, parameters=0.3, files=1 / 3, logs=0.5)
 
     def _apply(self, name: str, value: float) -> None:
         """Set a parameter that an uploaded file contains."""
@@ -93,10 +123,6 @@ class ArduPilotStorage:
         # The firmware ignores a value that is not finite (AP_Param.cpp, set_float).
         if name not in self._vehicle.faults.read_only_parameters and math.isfinite(value):
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))
-
-
-def _log_path(number: int) -> str:
-    return f"{LOG_FOLDER}/{number + 1:08}.BIN"
 
 
 _SAVE_INTERVAL_S = 30.0

@@ -14,14 +14,12 @@ from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.encoding import UNKNOWN_INDEX
-from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import ArduPilotCamera
 from aerokit.sim.ardupilot.devices import ArduPilotDevices
 from aerokit.sim.ardupilot.external import ArduPilotExternal
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import ArduPilotFence
-from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode, ArduPilotMotors
 from aerokit.sim.ardupilot.kinds import BOOT_TIMELINES, BootTimeline, parameters_of
@@ -136,11 +134,9 @@ class ArduPilotVehicle(ArduPilotHost):
         """Mission, fence and rally points, which survive a reboot."""
         self._reset()
         self._listen()
-        self.storage: ArduPilotStorage = ArduPilotStorage(
+        self.storage = ArduPilotStorage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
-        """Protocol servers of files, logs and parameters."""
-        self.files: FileTree = self.storage.files
 
     def _reset(self) -> None:
         """Create or reset the parts that do not survive a power cycle."""
@@ -229,11 +225,6 @@ class ArduPilotVehicle(ArduPilotHost):
     def move(self, dt: float) -> None:
         """Advance the motion by one tick."""
         raise NotImplementedError
-
-    @property
-    def ftp(self) -> ArduPilotFtp:
-        """The file server."""
-        return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
         """Return True unless a message is for another system, or for one of the other `components` of this vehicle.

@@ -176,10 +176,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
 
     def clear_files(self) -> None:
         """Delete all images."""
-        if "/DCIM" not in self.files:  # No image was taken yet.
-            return
-        for name, _ in self.files.entries("/DCIM"):
-            self.files.remove_file(f"/DCIM/{name}")
+        self.files.clear_folder("/DCIM")
 
     def expose(self, done: Callable[[CameraImageCaptured | None], None]) -> None:
         image = self._new_image()

@@ -13,7 +13,6 @@ from typing import ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.mavlink.signing import SigningKey
-from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
@@ -26,7 +25,6 @@ from aerokit.sim.px4.console import Px4LogStream, Px4Shell
 from aerokit.sim.px4.external import Px4External
 from aerokit.sim.px4.failsafes import Px4Failsafes
 from aerokit.sim.px4.flight import Px4Flight
-from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.links import Px4Events, Px4StreamRates, Px4TextLinks, on_the_wire
 from aerokit.sim.px4.manual import Px4Sticks
@@ -108,11 +106,7 @@ class Px4Vehicle(Px4Host):
         """Camera trigger, enabled while the parameter TRIG_MODE is not 0."""
         self._reset()
         self._listen()
-        self.storage: Px4Storage = Px4Storage(
-            self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s
-        )
-        """Protocol servers of files, logs and parameters."""
-        self.files: FileTree = self.storage.files
+        self.storage = Px4Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return handlers by MAV_CMD."""
@@ -174,10 +168,6 @@ class Px4Vehicle(Px4Host):
         self.on(m.Ping, self._on_ping)
         self.serve_timesync()
         self.missions.listen()
-
-    @property
-    def ftp(self) -> Px4Ftp:
-        return self.storage.ftp
 
     @property
     def airspeed_m_s(self) -> float:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 import pkgutil
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import ClassVar, NamedTuple
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.mavlink.enums import MavParamType, MavSeverity
 from aerokit.mavlink.frame import Frame
-from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat
+from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat, LogEntry, LogRequestData, LogRequestList
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
 from aerokit.protocols.ftp import DATA_SIZE
-from aerokit.protocols.servers.files import EINVAL, FileFault, FileHandle, FileTree
-from aerokit.sim.autopilot import VehicleSigning
-from aerokit.sim.logs import Px4LogServer, SimulatedLog
+from aerokit.protocols.servers.files import EINVAL, FileFault, FileHandle
+from aerokit.sim.autopilot import VehicleSigning, VehicleStorage
+from aerokit.sim.channel import Channel
+from aerokit.sim.logs import BLOCK_SIZE, LogServer, SimulatedLog
 from aerokit.sim.parameter_server import Px4ParameterServer
 from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.ftp import Px4Ftp
@@ -126,14 +128,46 @@ class _Writer(FileHandle):
         return True
 
 
-LOG_FOLDER = "/fs/microsd/log"
 DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
 
-_PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
+
+class Px4LogServer(LogServer):
+    """PX4's log server. Log numbers start at 0, and data is sent only after a list request.
+
+    All logs from ``start`` are listed, and ``end`` is only copied to ``last_log_num``. A new request replaces the
+    transfer. The last block is not cut to the requested size. Without logs, a list request is not answered.
+    """
+
+    FOLDER: ClassVar[str] = "/fs/microsd/log"
+    _was_listed = False
+
+    def path(self, index: int) -> str:
+        return f"{self.FOLDER}/2026-11-21/{10 + index:02}_00_00.ulg"
+
+    def _on_list(self, request: LogRequestList, channel: Channel) -> None:
+        self._was_listed = True
+        count = len(self.logs)
+        last = count if request.end == 0xFFFF else request.end
+        numbers = range(request.start, count)
+        self.transfer([partial(self._entry, number, last) for number in numbers], channel)
+
+    def _entry(self, number: int, last: int) -> LogEntry:
+        log = self.logs[number]
+        return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
+
+    def _on_data(self, request: LogRequestData, channel: Channel) -> None:
+        is_available = self._was_listed and request.id < len(self.logs)
+        if not is_available or request.ofs >= self.logs[request.id].size:
+            self.restart()
+            return
+        whole_blocks = max(1, math.ceil(request.count / BLOCK_SIZE))
+        self.transfer(self.blocks(request.id, request.id, request.ofs, whole_blocks * BLOCK_SIZE), channel)
+
+
 _LINK_SHARE = 0.5
 
 
-class Px4Storage:
+class Px4Storage(VehicleStorage):
     """Protocol servers of files, logs and parameters.
 
     ``parameter_file`` serves ``@PARAM/param.pck``, as PX4 does since August 2026. ``link_bytes_per_s`` is the
@@ -143,43 +177,17 @@ class Px4Storage:
     def __init__(
         self, px4: Px4Host, logs: Sequence[SimulatedLog], *, parameter_file: bool, link_bytes_per_s: float | None
     ) -> None:
+        super().__init__()
         self._px4 = px4
-        self.files: FileTree = FileTree()
-        self._put_logs(logs)
         if parameter_file:
             self.files.mounts["@PARAM"] = Px4ParameterMount(px4.parameters, self._apply)
         sends_param_error = not px4.version.startswith("1.16")
-        self.parameters: Px4ParameterServer = Px4ParameterServer(px4, px4.parameters, sends_errors=sends_param_error)
-        self.ftp: Px4Ftp = Px4Ftp(px4, self.files)
-        self.logs: Px4LogServer = Px4LogServer(
-            px4,
-            logs,
-            erase_files=self._erase_logs,
-            append_to_file=lambda number, data: self.files.append(_log_path(number), data),
-        )
-        if link_bytes_per_s is not None:
-            self.parameters.list_rate_hz = _LINK_SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
-            self.ftp.burst_interval_s = _FTP_FRAME / (_LINK_SHARE * link_bytes_per_s)
-            self.logs.rate_hz = _LINK_SHARE * link_bytes_per_s / _LOG_DATA_FRAME
-            self.parameters.burst = self.ftp.burst = self.logs.burst = 1
-
-    def restart(self) -> None:
-        self.parameters.restart()
-        self.ftp.restart()
-        self.logs.restart()
-
-    def _put_logs(self, logs: Sequence[SimulatedLog]) -> None:
-        for number, log in enumerate(logs):
-            self.files.put(_log_path(number), log.make, size=log.size)
-        if not logs:
-            # Creating and removing a file leaves the empty folder.
-            self.files.put(f"{LOG_FOLDER}/.keep", b"").remove_file(f"{LOG_FOLDER}/.keep")
-
-    def _erase_logs(self) -> None:
-        for day, _ in self.files.entries(LOG_FOLDER):
-            for name, _ in self.files.entries(f"{LOG_FOLDER}/{day}"):
-                self.files.remove_file(f"{LOG_FOLDER}/{day}/{name}")
-            self.files.remove_folder(f"{LOG_FOLDER}/{day}")
+        self.parameters = Px4ParameterServer(px4, px4.parameters, sends_errors=sends_param_error)
+        self.ftp = Px4Ftp(px4, self.files)
+        # Creating and removing a file leaves the folder of the logs, which exists even if there are none.
+        self.files.put(f"{Px4LogServer.FOLDER}/.keep", b"").clear_folder(Px4LogServer.FOLDER)
+        self.logs = Px4LogServer(px4, logs, self.files)
+        self.limit_rates(link_bytes_per_s, parameters=_LINK_SHARE, files=_LINK_SHARE, logs=_LINK_SHARE)
 
     def _apply(self, name: str, value: float) -> None:
         """Apply a parameter of an uploaded file."""
@@ -187,10 +195,6 @@ class Px4Storage:
         can_store = math.isfinite(value) or parameters.type(name) == MavParamType.REAL32
         if name not in self._px4.faults.read_only_parameters and can_store:
             parameters[name] = self.parameters.clamped(name, value)
-
-
-def _log_path(number: int) -> str:
-    return f"{LOG_FOLDER}/2026-11-21/{10 + number:02}_00_00.ulg"
 
 
 _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
