@@ -217,6 +217,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         self._unix_time_at_start = unix_time_at_boot
         self.signing = self.make_signing(signing_key, timestamp_at(unix_time_at_boot))
         self.corrections: ReceivedCorrections = ReceivedCorrections(self)
+        self.on(m.Timesync, self._on_timesync)
 
     @property
     def files(self) -> FileTree:
@@ -263,9 +264,6 @@ class SimulatedAutopilot(SimulatedVehicle):
         padded = (*numbers.split("."), "0", "0")  # The version "4.7" means 4.7.0.
         major, minor, patch = (int(number) for number in padded[:3])
         return major << 24 | minor << 16 | patch << 8 | _RELEASE_TYPES.get(release, 0)
-
-    def serve_timesync(self) -> None:
-        self.on(m.Timesync, self._on_timesync)
 
     def serve_commands(self, handlers: Mapping[int, CommandHandler]) -> CommandServer:
         """Answer the MAV_CMDs with these handlers, except those in ``unsupported_commands``."""

@@ -232,6 +232,12 @@ class Motion:
         """Direction of the movement over ground, in radians from north."""
         return math.atan2(self.velocity_east, self.velocity_north)
 
+    @property
+    def thrust_share(self) -> float:
+        """Thrust divided by the thrust of a level hover. The lean counts only up to 60 degrees (cosine 0.5)."""
+        vertical_share = max(0.5, math.cos(self.roll) * math.cos(self.pitch))
+        return max(0.0, 1.0 - self.acceleration_down / GRAVITY_M_S2) / vertical_share
+
     def distance_to(self, place: Ned) -> float:
         """Return the horizontal distance to a place."""
         north, east, _ = place

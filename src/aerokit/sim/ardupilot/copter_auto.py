@@ -394,7 +394,8 @@ class CopterAuto(MissionMode):
         if point is not None:
             _, _, down = point
             target_down = min(target_down, down)
-        self._leg = _ClimbLeg(self, copter.home_or_ground_down - target_down)
+        _, _, home_down = copter.home_or_ground
+        self._leg = _ClimbLeg(self, home_down - target_down)
 
     def _circle(self, item: MissionItem) -> None:
         self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)

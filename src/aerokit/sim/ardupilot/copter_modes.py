@@ -131,12 +131,6 @@ class CopterHost(ArduPilotVehicle):
     def look_at(self, place: Ned | None) -> None:
         self.yaw.set_region_of_interest(place)
 
-    @property
-    def home_or_ground_down(self) -> float:
-        """Down coordinate of home, or of the ground while home is not set."""
-        _, _, home_down = self.navigation.home or (0.0, 0.0, self.motion.ground_down)
-        return home_down
-
     def speed_limit(self, name: str) -> float:
         """Return a parameter in cm/s as m/s."""
         return self.parameters[name] / 100.0
@@ -186,7 +180,8 @@ class CopterTakeOff:
     def __init__(self, copter: CopterHost, altitude_m: float) -> None:
         self._copter = copter
         motion = copter.motion
-        self.target: Ned = (motion.north, motion.east, copter.home_or_ground_down - altitude_m)
+        _, _, home_down = copter.home_or_ground
+        self.target: Ned = (motion.north, motion.east, home_down - altitude_m)
         self.is_complete: bool = False
 
     def update(self, climb_m_s: float) -> None:
@@ -340,8 +335,7 @@ class CopterRtl(CopterModeBase):
         self.is_landing = False
         # The value 0 of RTL_SPEED selects WPNAV_SPEED.
         self.speed = copter.speed_limit("RTL_SPEED") or copter.speed_limit("WPNAV_SPEED")
-        # Without home, return to the place of the power-on.
-        home = copter.navigation.home or (0.0, 0.0, copter.motion.ground_down)
+        home = copter.home_or_ground
         _, _, home_down = home
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
         _, _, down = self._place

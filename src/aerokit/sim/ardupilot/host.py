@@ -18,7 +18,7 @@ from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import rotated
 from aerokit.sim.missions import MissionStore
-from aerokit.sim.motion import GRAVITY_M_S2, LocalFrame, Ned
+from aerokit.sim.motion import LocalFrame, Ned
 
 RC_ROLL, RC_PITCH, RC_THROTTLE, RC_YAW = range(4)
 """Indices of the RC channels of the sticks, in ArduPilot's default RCMAP."""
@@ -190,11 +190,8 @@ class ArduPilotMotors:
             self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)
         if landed or not self.is_armed:
             self.throttle = _IDLE_THROTTLE * self.spool
-            return
-        # The throttle compensates a lean of up to 60 degrees, whose cosine is 0.5.
-        vertical_share_of_thrust = max(0.5, math.cos(motion.roll) * math.cos(motion.pitch))
-        lift = 1.0 - motion.acceleration_down / GRAVITY_M_S2
-        self.throttle = max(0.0, min(1.0, _HOVER_THROTTLE * lift / vertical_share_of_thrust))
+        else:
+            self.throttle = min(1.0, _HOVER_THROTTLE * motion.thrust_share)
 
 
 # The following classes are the interfaces through which the parts of a vehicle use each other.
@@ -332,6 +329,11 @@ class ArduPilotHost(SimulatedAutopilot):
         return self.motors.is_armed
 
     @property
+    def home_or_ground(self) -> Ned:
+        """Home, or the power-on location while home is not set."""
+        return self.navigation.home or (0.0, 0.0, self.motion.ground_down)
+
+    @property
     def altitude_m(self) -> float:
         """Metres above home."""
         return self.navigation.altitude_above_home
@@ -379,7 +381,7 @@ class ArduPilotHost(SimulatedAutopilot):
             return None
         north, east = self.frame.to_local(latitude_e7, longitude_e7)
         if frame in _RELATIVE:
-            _, _, home_down = self.navigation.home or (0.0, 0.0, self.motion.ground_down)
+            _, _, home_down = self.home_or_ground
             return (north, east, home_down - altitude)
         if frame in _TERRAIN:
             return (north, east, self.motion.ground_down - altitude)

@@ -391,8 +391,10 @@ def place_of(vehicle: ArduPilotHost, item: MissionItem, current: Ned) -> Ned:
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
     """Execute DO_SET_HOME of a mission."""
+    # On Plane, unlike on the other vehicles, the coordinates 0, 0, 0 are an ordinary position.
+    has_no_place = (item.x, item.y, item.z) == (0, 0, 0) and vehicle.KIND != "plane"
     point: Ned | None = vehicle.motion.place
-    if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
+    if item.param1 != 1 and not has_no_place:
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
     if point is not None:
         vehicle.navigation.set_home(point, lock=False)

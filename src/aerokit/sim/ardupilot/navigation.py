@@ -86,7 +86,7 @@ class ArduPilotNavigation:
     def altitude_above_home(self) -> float:
         """Metres above home, or above the ground while home is not set."""
         motion = self._vehicle.motion
-        _, _, home_down = self.home or (0.0, 0.0, motion.ground_down)
+        _, _, home_down = self._vehicle.home_or_ground
         return home_down - motion.down
 
     def local(self, point: Ned) -> Ned:

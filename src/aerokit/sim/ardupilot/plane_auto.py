@@ -16,7 +16,7 @@ from aerokit.mavlink.enums import HeadingType, MavFrame, MavResult, MavSeverity,
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.mission_run import MissionMode
+from aerokit.sim.ardupilot.mission_run import MissionMode, set_home_from
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, to_int
@@ -52,7 +52,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             Cmd.NAV_RETURN_TO_LAUNCH: self._return,
             Cmd.CONDITION_DELAY: self._wait,
             Cmd.DO_CHANGE_SPEED: self._change_speed,
-            Cmd.DO_SET_HOME: self._set_home,
+            Cmd.DO_SET_HOME: lambda item: set_home_from(plane, item),
             **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START, Cmd.DO_FENCE_ENABLE), lambda _: None),
         }
 
@@ -203,12 +203,12 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 
     def _start_landing(self, item: MissionItem) -> None:
         self._go(item, _LAND)
-        wing, plane = self.vehicle.wing, self.vehicle
+        assert self._place is not None
+        plane = self.vehicle
+        north, east, _ = self._place
+        # Unlike for other commands, an altitude of 0 is an ordinary altitude.
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
-        start_north, start_east, _ = self._leg_start
-        north, east, down = (start_north, start_east, wing.ground_down) if point is None else point
-        if (item.x, item.y) == (0, 0):  # Zero coordinates mean the plane's coordinates.
-            north, east = start_north, start_east
+        _, _, down = point or (north, east, plane.wing.ground_down)
         self._landing = PlaneLanding(plane, (north, east, down))
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
@@ -223,14 +223,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if self.vehicle.is_valid_airspeed(item.param2):
             self.speed: float = item.param2
             self.vehicle.info(f"Set airspeed {item.param2:.0f} m/s")
-
-    def _set_home(self, item: MissionItem) -> None:
-        plane = self.vehicle
-        point: Ned | None = plane.wing.place
-        if item.param1 != 1:  # On Plane, unlike on Copter, the coordinates 0, 0 are an ordinary position.
-            point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
-        if point is not None:
-            plane.navigation.set_home(point, lock=False)
 
 
 _ATTITUDE_TIMEOUT_S = 3.0

@@ -40,11 +40,6 @@ class PlaneHost(ArduPilotVehicle):
         return self.parameters["AIRSPEED_CRUISE"]
 
     @property
-    def home_or_ground(self) -> Ned:
-        """Home, or the power-on location while home is not set."""
-        return self.navigation.home or (0.0, 0.0, self.wing.ground_down)
-
-    @property
     def home_of_rtl(self) -> Ned:
         """Home at RTL_ALTITUDE. If RTL_ALTITUDE is negative, home at the current altitude."""
         north, east, home_down = self.home_or_ground

@@ -293,17 +293,6 @@ def _display_value(sub: SubHost) -> m.NamedValueFloat:
     return m.NamedValueFloat(sub.time_boot_ms, name, DISPLAY_VALUES[name])
 
 
-def _rover_hud(rover: RoverHost) -> m.VfrHud:
-    # ArduRover sends no airspeed and no climb rate. The throttle is positive even in reverse.
-    motion, place = rover.motion, rover.navigation.position
-    heading = int(math.degrees(motion.yaw) % 360.0)
-    throttle = round(abs(rover.motors.throttle) * 100)
-    altitude = 0.0 if place is None else place.altitude_m
-    return m.VfrHud(
-        airspeed=0.0, groundspeed=motion.ground_speed_m_s, heading=heading, throttle=throttle, alt=altitude, climb=0.0
-    )
-
-
 _MIDDLE, _STICK_RANGE = 1500, 500
 # The pulses of control surfaces and thrusters deviate by up to this many µs from the middle of 1500 µs.
 _SURFACE_RANGE = 400
@@ -434,7 +423,6 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
         **_without(m.Wind.ID, m.TerrainReport.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
         m.ServoOutputRaw.ID: _rover_outputs,
         m.RcChannelsScaled.ID: lambda rover: m.RcChannelsScaled(rover.time_boot_ms, *(0,) * 9, rssi=_UNKNOWN_RSSI),
-        m.VfrHud.ID: _rover_hud,
         m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
     "sub": {

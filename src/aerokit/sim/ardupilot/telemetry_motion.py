@@ -67,11 +67,13 @@ def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
 
 def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
     motion, place = vehicle.motion, vehicle.navigation.position
-    airspeed = motion.airspeed_m_s if vehicle.navigation.has_position else 0.0
+    # ArduRover sends no airspeed and no climb rate. Its throttle is positive even in reverse.
+    is_rover = vehicle.KIND == "rover"
+    has_airspeed = vehicle.navigation.has_position and not is_rover
     return m.VfrHud(
-        airspeed=airspeed, groundspeed=motion.ground_speed_m_s, heading=int(math.degrees(motion.yaw) % 360.0),
-        throttle=round(vehicle.motors.throttle * 100), alt=0.0 if place is None else place.altitude_m,
-        climb=-motion.velocity_down,
+        airspeed=motion.airspeed_m_s if has_airspeed else 0.0, groundspeed=motion.ground_speed_m_s,
+        heading=int(math.degrees(motion.yaw) % 360.0), throttle=round(abs(vehicle.motors.throttle) * 100),
+        alt=0.0 if place is None else place.altitude_m, climb=0.0 if is_rover else -motion.velocity_down,
     )  # fmt: skip
 
 

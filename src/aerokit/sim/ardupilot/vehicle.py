@@ -171,7 +171,6 @@ class ArduPilotVehicle(ArduPilotHost):
         self.listen_for_setpoints()
         self.on(m.Heartbeat, self._on_heartbeat)
         self.on(m.SetMode, self._on_set_mode)
-        self.serve_timesync()
         self.rc.listen()
         self.external.listen()
         self.JOYSTICK(self)

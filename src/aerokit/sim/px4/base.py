@@ -17,7 +17,7 @@ from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
 from aerokit.sim.logs import SimulatedLog
-from aerokit.sim.motion import GRAVITY_M_S2, HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, Ned, SimulatedWind
+from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
@@ -166,7 +166,6 @@ class Px4Vehicle(Px4Host):
         self.log_stream: Px4LogStream = Px4LogStream(self)
         self.commands: CommandServer = self.serve_commands(self.make_commands())
         self.on(m.Ping, self._on_ping)
-        self.serve_timesync()
         self.missions.listen()
 
     @property
@@ -357,9 +356,7 @@ class Px4Vehicle(Px4Host):
     def _run_motors(self, dt: float) -> None:
         self.throttle = 0.0
         if self.is_armed and not self.is_landed:
-            lift = max(0.0, 1.0 - self.motion.acceleration_down / GRAVITY_M_S2)
-            vertical_share_of_thrust = max(0.5, math.cos(self.motion.roll) * math.cos(self.motion.pitch))
-            self.throttle = min(1.0, _HOVER_THROTTLE * lift / vertical_share_of_thrust)
+            self.throttle = min(1.0, _HOVER_THROTTLE * self.motion.thrust_share)
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
 
     def _detect_landing(self) -> None:

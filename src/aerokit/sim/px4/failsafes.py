@@ -113,7 +113,8 @@ class Px4Fence:
             index += 1
 
     def _place(self, item: MissionItem) -> tuple[float, float]:
-        return self._px4.frame.to_local(round(item.x), round(item.y))
+        north, east, _ = self._px4.place_of(item)
+        return (north, east)
 
 
 _INTERVAL_S = 0.2

@@ -6,7 +6,6 @@ import math
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType
-from aerokit.missions import MissionItem
 from aerokit.sim.motion import BRAKING_SHARE, Ned, approach_speed
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.external import PrecisionLanding
@@ -60,36 +59,21 @@ class Px4Orbit:
     def status(self) -> m.OrbitExecutionStatus:
         px4 = self._px4
         place = px4.frame.to_global(*self.middle, self.down)
-        return m.OrbitExecutionStatus(
-            px4.time_boot_us,
-            self.radius_m,
-            frame=MavFrame.GLOBAL,
-            x=place.latitude_e7,
-            y=place.longitude_e7,
-            z=place.altitude_m,
-        )
+        return m.OrbitExecutionStatus(px4.time_boot_us, self.radius_m, MavFrame.GLOBAL, *place)
 
 
 # Values of RTL_TYPE.
 _NEAREST, _RALLY_FIRST = (0, 3), 1
-_RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
     """Return the destination of RTL. The heights in parameters of RTL are relative to the destination."""
     rtl_type = round(px4.parameters["RTL_TYPE"])
-    rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
+    rally_points = [px4.place_of(item) for item in px4.missions.items(MavMissionType.RALLY)]
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
         return px4.home
     candidates = rally_points if rtl_type == _RALLY_FIRST else [px4.home, *rally_points]
     return min(candidates, key=px4.motion.distance_to)
-
-
-def _place(px4: Px4Host, item: MissionItem) -> Ned:
-    north, east = px4.frame.to_local(round(item.x), round(item.y))
-    _, _, home_down = px4.home
-    down_at_zero_altitude = home_down if item.frame in _RELATIVE else px4.frame.origin.altitude_m
-    return (north, east, down_at_zero_altitude - item.z)
 
 
 _SPOOL_UP_S = 1.8

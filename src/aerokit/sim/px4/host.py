@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
+from aerokit.mavlink.enums import MavFrame
 from aerokit.missions import MissionItem
 from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
 from aerokit.sim.channel import Channel
@@ -24,7 +25,6 @@ class Px4SticksInterface(Protocol):
 
     @property
     def are_fresh(self) -> bool: ...
-
     @property
     def are_wanted(self) -> bool: ...
 
@@ -34,25 +34,20 @@ class Px4ArmingInterface(Protocol):
     is_terminated: bool
 
     def disarm(self, by: str, *, force: bool = False) -> bool: ...
-
     def terminate(self) -> None: ...
-
     def report_changes(self) -> None: ...
 
 
 class Px4FenceInterface(Protocol):
     def on_uploaded(self) -> None: ...
-
     def allows(self, place: Ned) -> bool: ...
 
 
 class Px4FailsafesInterface(Protocol):
     @property
     def fence(self) -> Px4FenceInterface: ...
-
     @property
     def acts(self) -> bool: ...
-
     def arming_obstacles(self) -> list[str]: ...
 
 
@@ -67,14 +62,10 @@ class Px4FlightInterface(Protocol):
 
     @property
     def descent_speed_m_s(self) -> float: ...
-
     @property
     def top_speed_m_s(self) -> float: ...
-
     def stay_here(self) -> None: ...
-
     def go(self) -> None: ...
-
     def descend(self) -> None: ...
 
 
@@ -83,35 +74,25 @@ class Px4MissionInterface(Protocol):
 
     @property
     def wants_up(self) -> bool: ...
-
     def enter(self) -> None: ...
-
     def update(self) -> None: ...
-
     def on_replaced(self, current: int) -> None: ...
-
     def forget_reached(self) -> None: ...
-
     def set_current(self, seq: int) -> None: ...
 
 
 class Px4MissionsInterface(Protocol):
     @property
     def commands(self) -> Sequence[MissionItem]: ...
-
     def items(self, mission_type: int) -> Sequence[MissionItem]: ...
-
     def item(self, mission_type: int, seq: int) -> MissionItem | None: ...
-
     def count(self, mission_type: int) -> int: ...
-
     def on_item_changed(self, seq: int) -> None: ...
 
 
 class Px4OffboardInterface(Protocol):
     @property
     def wants_up(self) -> bool: ...
-
     def fly(self) -> None: ...
 
 
@@ -151,21 +132,25 @@ class Px4Host(SimulatedAutopilot):
         _, _, home_down = self.home
         return home_down - self.motion.down
 
+    def place_of(self, item: MissionItem) -> Ned:
+        """Return the position of a stored item of a mission, fence or list of rally points."""
+        north, east = self.frame.to_local(round(item.x), round(item.y))
+        _, _, home_down = self.home
+        is_absolute = item.frame == MavFrame.GLOBAL
+        down_at_zero_altitude = self.frame.origin.altitude_m if is_absolute else home_down
+        return (north, east, down_at_zero_altitude - item.z)
+
     @property
     def has_position(self) -> bool:
-        """True if the estimator has a global position."""
         raise NotImplementedError
 
     def can_run(self, mode: Px4Mode) -> bool:
-        """Return True if the requirements of the mode are met: sticks, mission, set-points or position."""
         raise NotImplementedError
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request. Return False if the mode is refused."""
         raise NotImplementedError
 
     def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode, which the next heartbeat reports."""
         raise NotImplementedError
 
     def leave_ground(self) -> None:

@@ -10,9 +10,10 @@ import math
 from collections.abc import Sequence
 
 from aerokit.mavlink.enums import MavCmd as Cmd
-from aerokit.mavlink.enums import MavFrame, MavSeverity, MavType, MissionState
+from aerokit.mavlink.enums import MavSeverity, MavType, MissionState
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
+from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
@@ -37,13 +38,15 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
+    _, _, home_down = px4.home
     for number, item in enumerate(items, start=1):
         if item.command in _STORED_ONLY:
             return f"item {number}: unsupported cmd: {item.command:d}"
         if item.command == Cmd.NAV_LAND and number == 1 and px4.is_landed:
             return "starts with landing"
         if item.command in _TAKE_OFFS:
-            if _height_above_home(px4, item) <= 0.0:
+            _, _, down = px4.place_of(item)
+            if down >= home_down:
                 return "Takeoff altitude below home altitude!"
             if has_place:
                 return "takeoff not first waypoint item"
@@ -72,12 +75,6 @@ def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     return None
 
 
-def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
-    _, _, home_down = px4.home
-    home_amsl = px4.frame.origin.altitude_m - home_down
-    return item.z - home_amsl if item.frame == MavFrame.GLOBAL else item.z
-
-
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
     """Return PX4's text about an invalid order of DO_LAND_START, landing and return."""
     # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
@@ -99,26 +96,18 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
 
 def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
     """Return the number of the first item outside the geofence. The first item has the number 1."""
-    _, _, home_down = px4.home
     for number, item in enumerate(items, start=1):
-        if item.command in _WITH_PLACE:
-            north, east = px4.frame.to_local(round(item.x), round(item.y))
-            down = home_down - _height_above_home(px4, item)
-            if not px4.failsafes.fence.allows((north, east, down)):
-                return number
+        if item.command in _WITH_PLACE and not px4.failsafes.fence.allows(px4.place_of(item)):
+            return number
     return None
 
 
 def distance_warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    home_north, home_east, _ = px4.home
-    for item in items:
-        if item.command in _WITH_PLACE:
-            north, east = px4.frame.to_local(round(item.x), round(item.y))
-            distance = math.hypot(north - home_north, east - home_east)
-            if distance < _MAX_FIRST_DISTANCE_M:
-                return None
-            return f"First waypoint far away from home: {int(distance)}m. Correct mission loaded?"
-    return None
+    first = next((item for item in items if item.command in _WITH_PLACE), None)
+    distance = 0.0 if first is None else math.dist(px4.place_of(first)[:2], px4.home[:2])
+    if distance < _MAX_FIRST_DISTANCE_M:
+        return None
+    return f"First waypoint far away from home: {int(distance)}m. Correct mission loaded?"
 
 
 _REPEATS = 10
@@ -313,16 +302,10 @@ class Px4Mission:
         if px4.is_armed:
             px4.info(f"Climb to {home_down - down:.1f} meters above home")
 
-    def _place(self, item: MissionItem) -> tuple[float, float, float]:
-        px4, motion = self._px4, self._px4.motion
-        north, east = px4.frame.to_local(round(item.x), round(item.y))
+    def _place(self, item: MissionItem) -> Ned:
         # For PX4, latitude and longitude 0 are an ordinary position.
-        if not math.isfinite(item.z):
-            return (north, east, motion.down)
-        _, _, home_down = px4.home
-        is_relative = item.frame == MavFrame.GLOBAL_RELATIVE_ALT
-        down_at_zero_altitude = home_down if is_relative else px4.frame.origin.altitude_m
-        return (north, east, down_at_zero_altitude - item.z)
+        north, east, down = self._px4.place_of(item)
+        return (north, east, down if math.isfinite(down) else self._px4.motion.down)
 
     def update(self) -> None:
         item, flight = self._item, self._px4.flight
