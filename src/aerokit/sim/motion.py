@@ -248,6 +248,12 @@ class Motion:
         north, east, _ = place
         return math.atan2(east - self.east, north - self.north)
 
+    def elevation_of(self, place: Ned) -> float:
+        """Return the angle in radians by which a place is above the horizon."""
+        _, _, down = place
+        depth = down - self.down
+        return math.atan2(-depth, self.distance_to(place))
+
     @property
     def stopping_place(self) -> Ned:
         """The place ahead at which :meth:`seek_position` stops the vehicle without flying back."""

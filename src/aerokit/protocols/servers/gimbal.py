@@ -177,6 +177,16 @@ def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:
     )  # fmt: skip
 
 
+SetAttitude = m.GimbalManagerSetAttitude | m.GimbalDeviceSetAttitude
+
+
+def angles_and_rates(message: SetAttitude) -> tuple[Angles, Angles]:
+    """Return the angles and the rates in a message. Those that it does not give are NaN."""
+    has_angles = not any(map(math.isnan, message.q))
+    roll, pitch, yaw = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+    return (roll, pitch, yaw), (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
+
+
 _UNCHANGED, _SENDER, _RELEASE = -1, -2, -3
 _REST_ANGLES = (0.0, 0.0, 0.0)
 _ABSOLUTE_FRAMES = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
@@ -281,11 +291,9 @@ class GimbalRequests:
         if self._gimbal.primary in (_NOBODY, sender_of(message)):
             self._apply_attitude(message)
 
-    def _apply_attitude(self, message: m.GimbalManagerSetAttitude | m.GimbalDeviceSetAttitude) -> None:
-        has_angles = not any(map(math.isnan, message.q))
-        roll, pitch, yaw = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
-        rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
-        self.apply(message.flags, (roll, pitch, yaw), rates)
+    def _apply_attitude(self, message: SetAttitude) -> None:
+        angles, rates = angles_and_rates(message)
+        self.apply(message.flags, angles, rates)
 
     def on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
         if self._may_control(sender_of(message), message.gimbal_device_id):

@@ -9,6 +9,7 @@ from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFoc
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import ReceivedCommand, to_int
+from aerokit.sim.motion import Ned
 
 _PERIOD_S, _DEFAULT_SHUTTER_S = 0.02, 0.1
 _IDLE, _INTERVAL_SET = 0, 2
@@ -32,7 +33,7 @@ class ArduPilotCamera:
         self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
         self.trigger_distance_m: float = 0.0  # Metres between two images triggered by distance; 0 is off.
         self._taken_at = -math.inf  # time of the last image
-        self._taken_place: tuple[float, float] | None = None  # (north, east) of the last image
+        self._taken_place: Ned | None = None  # place of the last image
         self._is_update_scheduled = False  # True while a call of `_update` is pending
         self.feedback: m.CameraFeedback = m.CameraFeedback(
             time_usec=0, target_system=0, cam_idx=0, img_idx=0, lat=0, lng=0, alt_msl=0.0, alt_rel=0.0, roll=0.0,
@@ -52,32 +53,16 @@ class ArduPilotCamera:
         """Take an image. Return False without a camera, or while its shutter is still open."""
         if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
             return False
-        motion = self._vehicle.motion
         self.image_count += 1
         self._taken_at = self._vehicle.now
-        self._taken_place = (motion.north, motion.east)
+        self._taken_place = self._vehicle.motion.place
         self.feedback = self._make_feedback()
         self._vehicle.send(self.feedback)
-        return True
-
-    def take_series(self, interval_s: float, count: int) -> bool:
-        """Take ``count`` images. -1 takes images until `stop`."""
-        if not self.is_fitted:
-            return False
-        self.interval_s = interval_s
-        self.remaining = count
-        self._schedule_update()
         return True
 
     def stop(self) -> None:
         self.interval_s = 0.0
         self.remaining = 0
-
-    def trigger_by_distance(self, metres: float) -> None:
-        """Take an image each time the vehicle has moved by this distance. 0 turns this off."""
-        self.trigger_distance_m = metres
-        self._taken_place = None
-        self._schedule_update()
 
     def _schedule_update(self) -> None:
         if not self._is_update_scheduled and (self.remaining or self.trigger_distance_m > 0):
@@ -97,35 +82,33 @@ class ArduPilotCamera:
 
     def _check_distance(self) -> None:
         motion = self._vehicle.motion
-        place = (motion.north, motion.east)
         if self._taken_place is None:
-            self._taken_place = place
-        elif math.dist(place, self._taken_place) >= self.trigger_distance_m:
+            self._taken_place = motion.place
+        elif motion.distance_to(self._taken_place) >= self.trigger_distance_m:
             self.take()
 
     def run(self, item: MissionItem) -> None:
         """Execute a camera command of a mission. Other commands are ignored."""
         if item.command == MavCmd.DO_DIGICAM_CONTROL:
-            takes_image = item.x == 1  # Param 5 of the command.
-            if takes_image:
-                self.take()
+            self.digicam_control(item)
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
-            self.trigger_by_distance(item.param1)
-            takes_first_image_now = item.param3 == 1.0
-            if takes_first_image_now:
-                self.take()
+            self.set_trigger_distance(item)
         elif item.command == MavCmd.IMAGE_START_CAPTURE:
-            interval_s, image_count = item.param2, item.param3
-            self._start(interval_s, image_count)
+            self._start(interval_s=item.param2, count=item.param3)
         elif item.command == MavCmd.IMAGE_STOP_CAPTURE:
             self.stop()
 
-    def _start(self, interval_s: float, count: float) -> bool:
+    def _start(self, *, interval_s: float, count: float) -> bool:
+        """Take an image, or start a series. Return False without a camera."""
         is_single_image = count == 1.0 or (interval_s == 0.0 and count == 0.0)
         if is_single_image:
             return self.take()
-        finite_interval_s = interval_s if math.isfinite(interval_s) else 0.0
-        return self.take_series(finite_interval_s, to_int(count) or _UNLIMITED)
+        if not self.is_fitted:
+            return False
+        self.interval_s = interval_s if math.isfinite(interval_s) else 0.0
+        self.remaining = to_int(count) or _UNLIMITED
+        self._schedule_update()
+        return True
 
     def start_capture(self, command: ReceivedCommand) -> int:
         # Param 1 is the number of the camera. 0 selects all cameras.
@@ -133,7 +116,8 @@ class ArduPilotCamera:
             return MavResult.UNSUPPORTED
         if command.param1 > 1.0:
             return MavResult.FAILED
-        return MavResult.ACCEPTED if self._start(command.param2, command.param3) else MavResult.FAILED
+        is_started = self._start(interval_s=command.param2, count=command.param3)
+        return MavResult.ACCEPTED if is_started else MavResult.FAILED
 
     def stop_capture(self, command: ReceivedCommand) -> int:
         is_supported = command.param1 == 0.0 or (command.param1 == 1.0 and self.is_fitted)
@@ -141,14 +125,19 @@ class ArduPilotCamera:
             self.stop()
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
-    def digicam_control(self, command: ReceivedCommand) -> int:
-        if command.x == 1:  # param 5
+    def digicam_control(self, command: ReceivedCommand | MissionItem) -> int:
+        takes_image = command.x == 1  # Param 5 of the command.
+        if takes_image:
             self.take()
         return MavResult.ACCEPTED
 
-    def set_trigger_distance(self, command: ReceivedCommand) -> int:
-        self.trigger_by_distance(command.param1)
-        if command.param3 == 1.0:
+    def set_trigger_distance(self, command: ReceivedCommand | MissionItem) -> int:
+        """Take an image each time the vehicle has moved by the distance. 0 turns this off."""
+        self.trigger_distance_m = command.param1
+        self._taken_place = None
+        self._schedule_update()
+        takes_first_image_now = command.param3 == 1.0
+        if takes_first_image_now:
             self.take()
         return MavResult.ACCEPTED
 

@@ -11,12 +11,13 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavDoRepositionFlags, MavFrame, MavMountMode, MavSeverity
 from aerokit.mavlink.enums import MavResult as Result
+from aerokit.protocols.servers.gimbal import angles_and_rates
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
-from aerokit.sim.motion import Ned, euler_from_quaternion
+from aerokit.sim.motion import Ned
 
 _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
 _FORCE_REBOOT = 20190226
@@ -371,21 +372,16 @@ class GimbalCommands:
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
         gimbal = self._gimbal(message.gimbal_device_id)
-        rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
-        has_angles = not any(map(math.isnan, message.q))
-        has_rates = not any(map(math.isnan, rates))
-        if gimbal is None or (has_angles and has_rates):  # The firmware ignores a message with both.
-            return
-        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
-        gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
+        angles, rates = angles_and_rates(message)
+        has_both = not any(map(math.isnan, (*angles, *rates)))
+        if gimbal is not None and not has_both:  # The firmware ignores a message with angles and rates.
+            gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
     def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
         gimbal = self._gimbal(message.gimbal_device_id)
-        values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
-        has_angles_and_rates = not any(map(math.isnan, values))
-        if gimbal is not None and not has_angles_and_rates:
-            angles = (0.0, message.pitch, message.yaw)
-            rates = (0.0, message.pitch_rate, message.yaw_rate)
+        angles, rates = (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate)
+        has_both = not any(map(math.isnan, (*angles, *rates)))
+        if gimbal is not None and not has_both:
             gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
 

@@ -304,7 +304,6 @@ class CopterFence(ArduPilotFence[CopterHost]):
     """ArduCopter's fence. In flight, FENCE_ACTION selects the mode after a breach."""
 
     PERIOD_S: ClassVar[float] = 0.1
-    CHECKS_DISARMED: ClassVar[bool] = True
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:

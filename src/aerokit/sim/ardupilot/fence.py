@@ -128,7 +128,6 @@ class ArduPilotFence(Generic[HostT]):
     """Minimum interval between two checks."""
     CIRCLE_BACKUP_M: ClassVar[float] = 20.0
     """Metres by which a breach of the circle must grow to count as a new breach."""
-    CHECKS_DISARMED: ClassVar[bool] = False
     MITIGATION: ClassVar[int] = FenceMitigate.UNKNOWN
     """FENCE_MITIGATE that FENCE_STATUS reports; UNKNOWN for firmwares without AVOID_ENABLE."""
 
@@ -231,7 +230,8 @@ class ArduPilotFence(Generic[HostT]):
         if not self.enabled and not self.configured & _MIN_ALT:
             return
         is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors
-        if not is_due or not (self.CHECKS_DISARMED or vehicle.is_armed):
+        is_checked = vehicle.is_armed or vehicle.KIND != "sub"  # ArduSub checks its fence only while armed.
+        if not is_due or not is_checked:
             return
         self._checked_at = vehicle.now
         breached_before = self.breached

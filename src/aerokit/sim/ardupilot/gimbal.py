@@ -120,10 +120,7 @@ class ArduPilotGimbal:
         """Aim at a place, if the place and the vehicle's position are known."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
-            place_north, place_east, place_down = place
-            north, east, down = place_north - motion.north, place_east - motion.east, place_down - motion.down
-            pitch = math.degrees(math.atan2(-down, math.hypot(north, east)))
-            yaw = math.degrees(math.atan2(east, north))
+            pitch, yaw = math.degrees(motion.elevation_of(place)), math.degrees(motion.bearing_to(place))
             self._target = MountTarget(0.0, pitch, yaw, is_from_north=True)
         return self._target
 

@@ -239,7 +239,6 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     """
 
     CIRCLE_BACKUP_M: ClassVar[float] = 100.0
-    CHECKS_DISARMED: ClassVar[bool] = True
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)

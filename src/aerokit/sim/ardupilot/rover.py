@@ -214,7 +214,6 @@ class RoverFence(ArduPilotFence[RoverHost]):
     """
 
     PERIOD_S: ClassVar[float] = 0.1
-    CHECKS_DISARMED: ClassVar[bool] = True
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:

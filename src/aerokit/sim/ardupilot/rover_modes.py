@@ -9,7 +9,7 @@ from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.sim.ardupilot.host import RC_ROLL, RC_THROTTLE, ArduPilotMode, variant
 from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
-from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
+from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, GuidedTargetMode, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.motion import Ned, wrap_pi
 from aerokit.sim.vehicle_motion import GroundMotion
 
@@ -172,45 +172,26 @@ class RoverAuto(RoverSubAuto):
         self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
 
 
-class RoverGuided(_Mode):
+class RoverGuided(GuidedTargetMode):
     """GUIDED: drives to a place, or for up to three seconds with a velocity and a turn rate."""
 
     number: int = RoverMode.GUIDED
     name = "GUID"
-
-    def __init__(self, rover: RoverHost) -> None:
-        super().__init__(rover)
-        self.speed: float = 0.0
-        self._place: Ned | None = None  # place to drive to; None while the rover follows `_target`
-        self._has_arrived = False
-        self._target: GuidedTarget | None = None  # None if the rover must stop
-        self._target_at = 0.0
+    vehicle: RoverHost
+    _has_arrived = False
 
     @property
     def can_change_speed(self) -> bool:  # type: ignore[override]
         return self._place is not None and not self._has_arrived
-
-    @property
-    def destination(self) -> Ned | None:
-        return self._place
 
     def enter(self, *, force: bool) -> bool:
         self._place = self._target = None
         return True
 
     def go_to(self, position: Ned) -> None:
-        self._place = position
+        super().go_to(position)
         self._has_arrived = False
-        self._target = None
         self.speed = self.vehicle.waypoint_speed
-
-    def set_target(self, target: GuidedTarget) -> None:
-        if target.position is not None:
-            self.go_to(target.position)
-            return
-        self._place = None
-        self._target = target
-        self._target_at = self.vehicle.now
 
     def update(self, dt: float) -> None:
         rover, target = self.vehicle, self._target

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, cast
+from typing import Any, ClassVar, cast
 
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavResult, SpeedType
@@ -17,6 +17,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
+from aerokit.sim.ardupilot.host import ArduPilotMode
 from aerokit.sim.ardupilot.mission_run import MissionMode, place_of, set_home_from
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
@@ -41,12 +42,31 @@ class GuidedTarget:
     """Seconds after which a target without a position expires."""
 
 
-class GuidedTargetMode(Protocol):
-    """Interface of a mode that follows targets."""
+class GuidedTargetMode(ArduPilotMode):
+    """Base of the guided modes: goes to a place, or follows a target without a place until the target expires."""
 
-    number: int
+    def __init__(self, vehicle: RoverSubVehicle) -> None:
+        super().__init__(vehicle)
+        self.speed: float = 0.0
+        self._place: Ned | None = None  # place to go to; None while the vehicle follows `_target`
+        self._target: GuidedTarget | None = None  # None if the vehicle must stop
+        self._target_at = 0.0
 
-    def set_target(self, target: GuidedTarget) -> None: ...
+    @property
+    def destination(self) -> Ned | None:
+        return self._place
+
+    def go_to(self, position: Ned) -> None:
+        self._place = position
+        self._target = None
+
+    def set_target(self, target: GuidedTarget) -> None:
+        if target.position is not None:
+            self.go_to(target.position)
+        else:
+            self._place = None
+            self._target = target
+            self._target_at = self.vehicle.now
 
 
 class GuidedSetpoints:

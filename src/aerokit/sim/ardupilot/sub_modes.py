@@ -8,7 +8,7 @@ from itertools import cycle
 
 from aerokit.mavlink.enums import SubMode
 from aerokit.sim.ardupilot.host import RC_THROTTLE, RC_YAW, SUB_FORWARD, SUB_LATERAL, ArduPilotMode, variant
-from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
+from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, GuidedTargetMode, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.commands import rotated
 from aerokit.sim.motion import Ned, wrap_pi
 from aerokit.sim.vehicle_motion import UnderwaterMotion
@@ -148,24 +148,14 @@ class SubAuto(RoverSubAuto):
         return f"Reached command #{index}"
 
 
-class SubGuided(_Mode):
+class SubGuided(GuidedTargetMode):
     """GUIDED: moves to a place, or for up to three seconds with a velocity. Without a target it stops."""
 
     number: int = SubMode.GUIDED
     name = "GUIDED"
     can_change_speed = True
-
-    def __init__(self, sub: SubHost) -> None:
-        super().__init__(sub)
-        self.speed: float = 0.0
-        self._place: Ned | None = None  # place to move to; None while the vehicle follows `_target`
-        self._target: GuidedTarget | None = None  # None if the vehicle must stop
-        self._target_at = 0.0
-        self._heading: float | None = None  # heading to hold, in radians; None to follow `_target`
-
-    @property
-    def destination(self) -> Ned | None:
-        return self._place
+    vehicle: SubHost
+    _heading: float | None = None  # heading to hold, in radians; None to follow `_target`
 
     def enter(self, *, force: bool) -> bool:
         self._place = self._target = self._heading = None
@@ -173,19 +163,15 @@ class SubGuided(_Mode):
         return True
 
     def go_to(self, position: Ned) -> None:
-        self._place = position
-        self._target = self._heading = None
+        super().go_to(position)
+        self._heading = None
 
     def set_target(self, target: GuidedTarget) -> None:
         if target.position is not None:
             motion = self.vehicle.motion
             # As in SITL, a new position starts from rest.
             motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0
-            self.go_to(target.position)
-        else:
-            self._place = None
-            self._target = target
-            self._target_at = self.vehicle.now
+        super().set_target(target)
         self._heading = target.yaw
 
     def face(self, heading: float) -> None:

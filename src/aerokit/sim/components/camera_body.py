@@ -11,14 +11,13 @@ from aerokit.mavlink.messages import CameraImageCaptured, CameraTrackingGeoStatu
 from aerokit.parameters import parse_definition
 from aerokit.parameters.definition import CameraDefinition
 from aerokit.protocols.servers.camera import camera_builders
-from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice
+from aerokit.protocols.servers.camera_device import CameraDevice
 from aerokit.protocols.servers.files import FileTree
 from aerokit.protocols.servers.host import ServerHost
 from aerokit.protocols.servers.intervals import Builder
-from aerokit.sim.components.captures import FOCAL_LENGTH_MM, GREY_JPEG, Lens, MemoryCard, tracked_place
+from aerokit.sim.components.captures import FOCAL_LENGTH_MM, GREY_JPEG, Lens, MemoryCard, captured_image, tracked_place
 from aerokit.sim.components.component import ExtendedParameters, SimulatedComponent, pose_of
 from aerokit.sim.components.gimbal import SimulatedGimbal
-from aerokit.sim.motion import quaternion_from_euler
 
 _SENSOR_MM = (6.17, 4.63)
 DEFINITION_PATH = "/camera_definition.xml"
@@ -179,25 +178,9 @@ class CameraBody(SimulatedComponent, CameraDevice):
         self.files.clear_folder("/DCIM")
 
     def expose(self, done: Callable[[CameraImageCaptured | None], None]) -> None:
-        image = self._new_image()
+        # A camera that is a separate component has the id 0.
+        image = captured_image(self.vehicle, self.time_boot_ms, self.angles(), camera_id=0)
         self.call_later(self.shutter_s, lambda: done(image))
-
-    def _new_image(self) -> CameraImageCaptured:
-        pose, angles = pose_of(self.vehicle), self.angles()
-        place = None if pose is None else pose.place
-        return CameraImageCaptured(
-            time_boot_ms=self.time_boot_ms,
-            time_utc=round(getattr(self.vehicle, "unix_time", 0.0) * 1e6),
-            camera_id=0,  # A camera that is a separate component has the id 0.
-            lat=0 if place is None else place.latitude_e7,
-            lon=0 if place is None else place.longitude_e7,
-            alt=0 if place is None else round(place.altitude_m * 1000),
-            relative_alt=0 if pose is None else round(pose.height_m * 1000),
-            q=UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles),
-            image_index=0,
-            capture_result=0,
-            file_url="",
-        )
 
     def store_image(self, image: CameraImageCaptured) -> str | None:
         if not self.card.store(self.image_mib):

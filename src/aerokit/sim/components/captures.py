@@ -10,7 +10,8 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraZoomType, SetFocusType, StorageStatus, StorageType, StorageUsageFlag
 from aerokit.mavlink.messages import StorageInformation
 from aerokit.sim.components.component import SimulatedComponent, pose_of
-from aerokit.sim.motion import LocalFrame
+from aerokit.sim.motion import GlobalPoint, LocalFrame, quaternion_from_euler
+from aerokit.sim.vehicle import SimulatedVehicle
 
 GREY_JPEG = base64.b85decode(
     "|JeWF01!$>Nk#wx0RR9200961|JwjV02B@n5)Ta&5)cv>6%-gAG9exu93DL^E+jHZKuk+VKt@GST61DhRc%&9Mr4R(ZFhTtf`Lw8jhBpl"
@@ -140,6 +141,30 @@ class Lens:
         else:
             return False
         return True
+
+
+_UNKNOWN_ATTITUDE = (math.nan,) * 4
+
+
+def captured_image(
+    vehicle: SimulatedVehicle,
+    time_boot_ms: int,
+    angles: Angles | None,
+    *,
+    camera_id: int = 0,
+    index: int = 0,
+    result: int = 0,
+) -> m.CameraImageCaptured:
+    """Return CAMERA_IMAGE_CAPTURED with the true position of a vehicle. ``angles`` are those of the camera."""
+    pose = pose_of(vehicle)
+    place = GlobalPoint(0, 0, 0.0) if pose is None else pose.place
+    return m.CameraImageCaptured(
+        time_boot_ms=time_boot_ms, time_utc=round(getattr(vehicle, "unix_time", 0.0) * 1e6), camera_id=camera_id,
+        lat=place.latitude_e7, lon=place.longitude_e7, alt=round(place.altitude_m * 1000),
+        relative_alt=0 if pose is None else round(pose.height_m * 1000),
+        q=_UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles), image_index=index,
+        capture_result=result, file_url="",
+    )  # fmt: skip
 
 
 # With a pitch above this limit, the optical axis meets the ground too far away or not at all.

@@ -15,10 +15,11 @@ from collections.abc import Callable
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.protocols.servers.gimbal import Angles, angles_and_rates
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
-from aerokit.sim.components.component import pose_of
-from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
+from aerokit.sim.components.captures import captured_image
+from aerokit.sim.motion import Ned, quaternion_from_euler
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
@@ -38,7 +39,6 @@ _CAPABILITIES = (
     _Can.HAS_NEUTRAL | _Can.HAS_ROLL_LOCK | _Can.HAS_PITCH_AXIS | _Can.HAS_PITCH_LOCK
     | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_LOCK | _Can.CAN_POINT_LOCATION_GLOBAL
 )  # fmt: skip
-Angles = tuple[float, float, float]
 _NEUTRAL: Angles = (0.0, 0.0, 0.0)
 
 
@@ -53,7 +53,7 @@ class Px4Gimbal:
         self._target = self._rates = _NEUTRAL
         self._target_at = 0.0
         self._flags = 0  # GIMBAL_MANAGER_FLAGS
-        self._place: tuple[int, int, float] | None = None  # region of interest; None to follow the set-point
+        self._place: Ned | None = None  # region of interest; None to follow the set-point
         self._was_returning = False  # True if the vehicle was returning at the last check
         self.is_fitted: bool = False  # True if MNT_MODE_IN enabled the gimbal at power-on.
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
@@ -94,20 +94,12 @@ class Px4Gimbal:
         )
         return (roll, pitch, yaw)
 
-    def _angles_to(self, place: tuple[int, int, float]) -> Angles:
-        """Return the angles that point at a place, with yaw from north.
-
-        ``place`` has latitude and longitude in degrees times 1e7, and the altitude AMSL.
-        """
-        latitude_e7, longitude_e7, altitude_m = place
+    def _angles_to(self, place: Ned) -> Angles:
+        """Return the angles that point at a place, with yaw from north."""
         motion = self._px4.motion
-        place_north, place_east = self._px4.frame.to_local(latitude_e7, longitude_e7)
-        north, east = place_north - motion.north, place_east - motion.east
-        own_altitude_m = self._px4.frame.to_global(*motion.place).altitude_m
-        pitch = math.atan2(altitude_m - own_altitude_m, math.hypot(north, east))
         _, (min_pitch_deg, max_pitch_deg), _ = _LIMITS
-        pitch = max(math.radians(min_pitch_deg), min(math.radians(max_pitch_deg), pitch))
-        return (0.0, pitch, math.atan2(east, north))
+        pitch = max(math.radians(min_pitch_deg), min(math.radians(max_pitch_deg), motion.elevation_of(place)))
+        return (0.0, pitch, motion.bearing_to(place))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
         """Set the angles, and the rates at which they change. If any angle is NaN, all angles stay."""
@@ -131,7 +123,8 @@ class Px4Gimbal:
 
     def look_at(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> None:
         """Point at a position. The altitude is AMSL."""
-        self._place = (latitude_e7, longitude_e7, altitude_m)
+        frame = self._px4.frame
+        self._place = (*frame.to_local(latitude_e7, longitude_e7), frame.origin.altitude_m - altitude_m)
 
     def _poll_return(self) -> None:
         is_going_home = self._px4.mode == RTL
@@ -143,10 +136,8 @@ class Px4Gimbal:
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
         if not self.is_fitted or sender_of(message) != self.in_control:
             return
-        has_angles = not any(map(math.isnan, message.q))
-        roll, pitch, yaw = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
-        rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
-        self.apply(message.flags, (roll, pitch, yaw), rates)
+        angles, rates = angles_and_rates(message)
+        self.apply(message.flags, angles, rates)
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
         if not self.is_fitted:
@@ -331,22 +322,8 @@ class Px4CameraTrigger:
             px4.call_later(_GEOTAG_DELAY_S, lambda: self._send_captured(number))
 
     def _send_captured(self, number: int) -> None:
-        px4, pose = self._px4, pose_of(self._px4)
-        if pose is None:
-            return
-        place = pose.place
-        px4.send(
-            m.CameraImageCaptured(
-                time_boot_ms=px4.time_boot_ms,
-                time_utc=round(px4.unix_time * 1e6),
-                camera_id=_DEFAULT_CAMERA_ID,
-                lat=place.latitude_e7,
-                lon=place.longitude_e7,
-                alt=round(place.altitude_m * 1000),
-                relative_alt=round(pose.height_m * 1000),
-                q=quaternion_from_euler(pose.roll, pose.pitch, pose.yaw),
-                image_index=number,
-                capture_result=1,  # successful
-                file_url="",
-            )
+        px4, successful = self._px4, 1
+        image = captured_image(
+            px4, px4.time_boot_ms, px4.motion.angles, camera_id=_DEFAULT_CAMERA_ID, index=number, result=successful
         )
+        px4.send(image)
