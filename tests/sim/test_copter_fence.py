@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import CopterMode, FenceBreach, MavCmd, MavMissionTyp
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedCopter
-from aerokit.sim.ardupilot.fence import CircleZone, PolygonZone
+from aerokit.sim.missions import CircleZone, PolygonZone
 
 ARM = MavCmd.COMPONENT_ARM_DISARM
 FENCE = MavCmd.DO_FENCE_ENABLE

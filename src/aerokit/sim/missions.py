@@ -1,4 +1,4 @@
-"""Missions, fences and rally points of a simulated vehicle: conversions and the ``@MISSION`` files.
+"""Missions, fences and rally points of a simulated vehicle: conversions, ``@MISSION`` files, fence zones.
 
 `sim.ardupilot.mission_server` and `sim.px4.mission_server` extend the server of `protocols.servers.missions` with the
 behaviour of the autopilots. https://mavlink.io/en/services/mission.html
@@ -6,17 +6,19 @@ behaviour of the autopilots. https://mavlink.io/en/services/mission.html
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Protocol
 
 from aerokit.errors import InvalidArgument, RemoteProtocolError
-from aerokit.mavlink.enums import MavMissionResult, MavMissionType
+from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import NO_CLEAR, pack_items, read_header, unpack_items
 from aerokit.protocols.servers.files import EINVAL, ENFILE, ENOENT, FileFault, FileHandle, Mount, UploadedFile
+from aerokit.sim.motion import LocalFrame
 
 INVALID_INDEX = 0xFFFF
 """The value of an unset index."""
@@ -127,3 +129,100 @@ def _type_of(path: str) -> int:
     if path not in _FILES:
         raise FileFault(ENOENT)
     return _FILES[path]
+
+
+_POLYGON_INCLUSION, _CIRCLE_INCLUSION = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_INCLUSION
+_POLYGONS = (_POLYGON_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
+_CIRCLES = (_CIRCLE_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_EXCLUSION)
+Point = tuple[float, float]
+
+
+class FenceZones:
+    """Inclusion and exclusion zones of an uploaded fence. A `Point` is (north, east) in the world frame, in metres."""
+
+    def __init__(self, items: Sequence[MissionItem], frame: LocalFrame) -> None:
+        self._inclusions: list[PolygonZone | CircleZone] = []
+        self._exclusions: list[PolygonZone | CircleZone] = []
+        places = [frame.to_local(round(item.x), round(item.y)) for item in items]
+        index = 0
+        while index < len(items):
+            item = items[index]
+            is_inclusion = item.command in (_POLYGON_INCLUSION, _CIRCLE_INCLUSION)
+            zones = self._inclusions if is_inclusion else self._exclusions
+            count = 1  # number of items of this zone
+            if item.command in _CIRCLES:
+                zones.append(CircleZone(places[index], item.param1))
+            elif item.command in _POLYGONS:
+                count = max(1, int(item.param1))  # Param 1 of each corner is the number of corners.
+                zones.append(PolygonZone(places[index : index + count]))
+            index += count
+
+    def __bool__(self) -> bool:
+        # A return point is not a zone.
+        return bool(self._inclusions or self._exclusions)
+
+    @property
+    def smallest_inclusion_m(self) -> float:
+        """Radius of the smallest inclusion circle."""
+        return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
+
+    def breach_m(self, place: Point, *, union: bool = False) -> float:
+        """Return the distance beyond the border in metres, which is negative inside the allowed area.
+
+        With ``union``, the allowed area is the union of the inclusion zones. Otherwise it is their intersection.
+        """
+        out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
+        into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]
+        if union and out_of_inclusions:  # A place inside one of the inclusion zones is allowed.
+            out_of_inclusions = [min(out_of_inclusions)]
+        return max(out_of_inclusions + into_exclusions, default=-math.inf)
+
+
+class CircleZone:
+    """Circle with a radius in metres."""
+
+    def __init__(self, center: Point, radius: float) -> None:
+        self.radius = radius
+        self._center = center
+
+    def outside_m(self, place: Point) -> float:
+        """Return the distance from the border in metres, which is negative inside."""
+        return math.dist(place, self._center) - self.radius
+
+
+class PolygonZone:
+    """Polygon given by its corners in order."""
+
+    def __init__(self, corners: Sequence[Point]) -> None:
+        self._sides = list(zip(corners, [*corners[1:], corners[0]], strict=True))
+
+    def outside_m(self, place: Point) -> float:
+        """Return the distance from the border in metres, which is negative inside."""
+        distance = min(_distance_to_edge(place, start, end) for start, end in self._sides)
+        crossings = sum(_crosses(place, start, end) for start, end in self._sides)
+        is_inside = crossings % 2 == 1  # A ray from a point inside crosses the border an odd number of times.
+        return -distance if is_inside else distance
+
+
+def _distance_to_edge(place: Point, start: Point, end: Point) -> float:
+    place_north, place_east = place
+    start_north, start_east = start
+    end_north, end_east = end
+    north, east = end_north - start_north, end_east - start_east
+    squared_length = north * north + east * east
+    share = 0.0  # Point of the edge that is nearest to the place: 0 is the start, 1 the end.
+    if squared_length > 0.0:
+        projection = ((place_north - start_north) * north + (place_east - start_east) * east) / squared_length
+        share = min(1.0, max(0.0, projection))
+    return math.dist(place, (start_north + share * north, start_east + share * east))
+
+
+def _crosses(place: Point, start: Point, end: Point) -> bool:
+    """Return True if a ray from ``place`` to the north crosses the line from ``start`` to ``end``."""
+    place_north, place_east = place
+    start_north, start_east = start
+    end_north, end_east = end
+    if (start_east > place_east) == (end_east > place_east):
+        return False
+    share = (place_east - start_east) / (end_east - start_east)
+    return place_north < start_north + share * (end_north - start_north)

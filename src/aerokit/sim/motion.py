@@ -125,17 +125,6 @@ def approach_speed(distance: float, deceleration: float) -> float:
     return math.sqrt(2.0 * deceleration * (distance - deceleration / 2.0))
 
 
-def crosses(place: tuple[float, float], start: tuple[float, float], end: tuple[float, float]) -> bool:
-    """Return True if a ray from ``place`` to the north crosses the line from ``start`` to ``end``."""
-    place_north, place_east = place
-    start_north, start_east = start
-    end_north, end_east = end
-    if (start_east > place_east) == (end_east > place_east):
-        return False
-    share = (place_east - start_east) / (end_east - start_east)
-    return place_north < start_north + share * (end_north - start_north)
-
-
 @dataclass
 class MotionLimits:
     """Limits of the airframe and its controller."""

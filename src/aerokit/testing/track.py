@@ -25,7 +25,7 @@ from aerokit.autopilots import autopilot_for
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.position import Position
-from aerokit.sim.ardupilot.fence import PolygonZone
+from aerokit.sim.missions import PolygonZone
 from aerokit.sim.motion import true_place
 from aerokit.sim.vehicle import SimulatedVehicle
 from aerokit.testing.picture import save_picture

@@ -7,96 +7,11 @@ from collections.abc import Sequence
 from typing import ClassVar, Generic
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import FenceBreach, FenceMitigate, FenceType, MavCmd, MavMissionType, MavResult, MavSeverity
-from aerokit.missions import MissionItem
+from aerokit.mavlink.enums import FenceBreach, FenceMitigate, FenceType, MavMissionType, MavResult, MavSeverity
 from aerokit.sim.ardupilot.host import ArduPilotMode, HostT
 from aerokit.sim.commands import ReceivedCommand, to_int
-from aerokit.sim.motion import LocalFrame, Ned, crosses
-
-_IN, _OUT = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION
-_CIRCLE_IN, _CIRCLE_OUT = MavCmd.NAV_FENCE_CIRCLE_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_EXCLUSION
-Point = tuple[float, float]
-
-
-class FenceZones:
-    """Inclusion and exclusion zones of an uploaded fence. A `Point` is (north, east) in the world frame, in metres."""
-
-    def __init__(self, items: Sequence[MissionItem], frame: LocalFrame) -> None:
-        self._inclusions: list[PolygonZone | CircleZone] = []
-        self._exclusions: list[PolygonZone | CircleZone] = []
-        corners: list[Point] = []
-        for item in items:
-            place = frame.to_local(int(item.x), int(item.y))
-            if item.command in (_CIRCLE_IN, _CIRCLE_OUT):
-                zones = self._inclusions if item.command == _CIRCLE_IN else self._exclusions
-                zones.append(CircleZone(place, item.param1))
-            elif item.command in (_IN, _OUT):
-                corners.append(place)
-                is_polygon_complete = len(corners) == int(item.param1)
-                if is_polygon_complete:
-                    zones = self._inclusions if item.command == _IN else self._exclusions
-                    zones.append(PolygonZone(corners))
-                    corners = []
-
-    def __bool__(self) -> bool:
-        # A return point is not a zone.
-        return bool(self._inclusions or self._exclusions)
-
-    @property
-    def smallest_inclusion_m(self) -> float:
-        """Radius of the smallest inclusion circle."""
-        return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
-
-    def breach_m(self, place: Point, *, union: bool = False) -> float:
-        """Return the distance beyond the border in metres, which is negative inside the allowed area.
-
-        With ``union``, the allowed area is the union of the inclusion zones. Otherwise it is their intersection.
-        """
-        out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
-        into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]
-        if union and out_of_inclusions:  # A place inside one of the inclusion zones is allowed.
-            out_of_inclusions = [min(out_of_inclusions)]
-        return max(out_of_inclusions + into_exclusions, default=-math.inf)
-
-
-class CircleZone:
-    """Circle with a radius in metres."""
-
-    def __init__(self, center: Point, radius: float) -> None:
-        self.radius = radius
-        self._center = center
-
-    def outside_m(self, place: Point) -> float:
-        """Return the distance from the border in metres, which is negative inside."""
-        return math.dist(place, self._center) - self.radius
-
-
-class PolygonZone:
-    """Polygon given by its corners in order."""
-
-    def __init__(self, corners: Sequence[Point]) -> None:
-        self._sides = list(zip(corners, [*corners[1:], corners[0]], strict=True))
-
-    def outside_m(self, place: Point) -> float:
-        """Return the distance from the border in metres, which is negative inside."""
-        distance = min(_distance_to_edge(place, start, end) for start, end in self._sides)
-        crossings = sum(crosses(place, start, end) for start, end in self._sides)
-        is_inside = crossings % 2 == 1  # A ray from a point inside crosses the border an odd number of times.
-        return -distance if is_inside else distance
-
-
-def _distance_to_edge(place: Point, start: Point, end: Point) -> float:
-    place_north, place_east = place
-    start_north, start_east = start
-    end_north, end_east = end
-    north, east = end_north - start_north, end_east - start_east
-    squared_length = north * north + east * east
-    share = 0.0  # Point of the edge that is nearest to the place: 0 is the start, 1 the end.
-    if squared_length > 0.0:
-        projection = ((place_north - start_north) * north + (place_east - start_east) * east) / squared_length
-        share = min(1.0, max(0.0, projection))
-    return math.dist(place, (start_north + share * north, start_east + share * east))
-
+from aerokit.sim.missions import FenceZones
+from aerokit.sim.motion import Ned
 
 # Bits of FENCE_TYPE.
 _MAX_ALT, _CIRCLE = int(FenceType.ALT_MAX), int(FenceType.CIRCLE)

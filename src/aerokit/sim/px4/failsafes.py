@@ -9,32 +9,19 @@ cause, deferred failsafes, parachutes, predicted breaches (GF_PREDICT).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from enum import IntEnum
-from typing import NamedTuple
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavBatteryChargeState, MavMissionType, MavSeverity, MavType
-from aerokit.mavlink.enums import MavCmd as Cmd
-from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
-from aerokit.sim.motion import Ned, crosses
+from aerokit.sim.missions import FenceZones
+from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, MODES, OFFBOARD, ORBIT, RTL, Px4Mode
 
-# Commands of the areas: True for an inclusion area, False for an exclusion area.
-_POLYGONS = {Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
-_CIRCLES = {Cmd.NAV_FENCE_CIRCLE_INCLUSION: True, Cmd.NAV_FENCE_CIRCLE_EXCLUSION: False}
 _NO_ACTION, _WARNING = 0, 1
 _BATTERY_LAND, _BATTERY_RETURN = 2, 3
-
-
-class _Area(NamedTuple):
-    """An area of the geofence, and whether it contains the point in question."""
-
-    is_inclusion: bool
-    contains_point: bool
 
 
 class Px4Fence:
@@ -45,11 +32,11 @@ class Px4Fence:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._is_valid = True
+        self._is_valid = True  # False disables the uploaded zones, because they do not allow home
 
     def on_uploaded(self) -> None:
         home_north, home_east, _ = self._px4.home
-        self._is_valid = self._areas_allow(home_north, home_east)
+        self._is_valid = self._zones_allow(home_north, home_east)
         if not self._is_valid:
             self._px4.send_text(MavSeverity.CRITICAL, "Geofence invalid, doesn't contain Home position")
 
@@ -77,44 +64,13 @@ class Px4Fence:
             breaches.append(TOO_FAR)
         if 0 < max_height < home_down - down:
             breaches.append(TOO_HIGH)
-        if not self._is_inside(north, east):
+        if self._is_valid and not self._zones_allow(north, east):
             breaches.append(OUTSIDE)
         return breaches
 
-    def _is_inside(self, north: float, east: float) -> bool:
-        if not self._is_valid or not self._px4.missions.count(MavMissionType.FENCE):
-            return True
-        return self._areas_allow(north, east)
-
-    def _areas_allow(self, north: float, east: float) -> bool:
-        areas = list(self._areas(north, east))
-        if any(area.contains_point for area in areas if not area.is_inclusion):
-            return False
-        inclusions = [area for area in areas if area.is_inclusion]
-        return not inclusions or any(area.contains_point for area in inclusions)
-
-    def _areas(self, north: float, east: float) -> Iterator[_Area]:
-        items, index = self._px4.missions.items(MavMissionType.FENCE), 0
-        while index < len(items):
-            item = items[index]
-            if item.command in _POLYGONS:
-                count = max(1, int(item.param1))  # Param 1 of each corner is the number of corners.
-                corners = [self._place(corner) for corner in items[index : index + count]]
-                sides = zip(corners, [corners[-1], *corners[:-1]], strict=True)
-                crossings = sum(crosses((north, east), corner, previous) for corner, previous in sides)
-                # A ray from a point inside crosses the border an odd number of times.
-                yield _Area(_POLYGONS[Cmd(item.command)], crossings % 2 == 1)
-                index += count
-                continue
-            if item.command in _CIRCLES:
-                center = self._place(item)
-                is_in_circle = math.dist(center, (north, east)) <= item.param1
-                yield _Area(_CIRCLES[Cmd(item.command)], is_in_circle)
-            index += 1
-
-    def _place(self, item: MissionItem) -> tuple[float, float]:
-        north, east, _ = self._px4.place_of(item)
-        return (north, east)
+    def _zones_allow(self, north: float, east: float) -> bool:
+        zones = FenceZones(self._px4.missions.items(MavMissionType.FENCE), self._px4.frame)
+        return zones.breach_m((north, east), union=True) <= 0.0
 
 
 _INTERVAL_S = 0.2
