@@ -45,17 +45,18 @@ class AccelerometerCalibration:
     def start(self) -> None:
         self._run_number += 1
         self._vehicle.send_text(MavSeverity.CRITICAL, "Place vehicle level and press any key.")
-        self._request(self._run_number, AccelcalVehiclePos.LEVEL)
+        self._announce(AccelcalVehiclePos.LEVEL)
 
     def confirm(self, command: ReceivedCommand) -> int:
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
         self._requested = None
         run_number, position = self._run_number, to_int(command.param1)
-        self._vehicle.call_later(_MEASUREMENT_TIME_S, lambda: self._on_sample(run_number, position))
+        self._vehicle.call_later(_MEASUREMENT_TIME_S, lambda: self._on_measured(run_number, position))
         return MavResult.ACCEPTED
 
-    def _on_sample(self, run_number: int, position: int) -> None:
+    def _on_measured(self, run_number: int, position: int) -> None:
+        """Continue with the next position, or end the calibration, after the measurement in a position."""
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         is_first_position = position == AccelcalVehiclePos.LEVEL
@@ -64,25 +65,25 @@ class AccelerometerCalibration:
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
         else:
-            self._request(run_number, position + 1)
+            self._announce(position + 1)
 
     def _end(self, text: str, result: int) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
-        self._request(self._run_number, result)
+        self._announce(result)
 
-    def _request(self, run_number: int, position: int) -> None:
+    def _announce(self, position: int) -> None:
         """Send this position or result every second until it is confirmed."""
         self._requested = position
+        self._send_until_confirmed(self._run_number, position)
 
-        def request_until_confirmed() -> None:
-            if run_number == self._run_number and self._requested == position:
-                target, confirmation, unused_params = (0, 0), 0, (0.0,) * 6
-                self._vehicle.send(
-                    m.CommandLong(*target, MavCmd.ACCELCAL_VEHICLE_POS, confirmation, float(position), *unused_params)
-                )
-                self._vehicle.call_later(_REPEAT_INTERVAL_S, request_until_confirmed)
-
-        request_until_confirmed()
+    def _send_until_confirmed(self, run_number: int, position: int) -> None:
+        if run_number != self._run_number or self._requested != position:
+            return
+        target, confirmation, unused_params = (0, 0), 0, (0.0,) * 6
+        self._vehicle.send(
+            m.CommandLong(*target, MavCmd.ACCELCAL_VEHICLE_POS, confirmation, float(position), *unused_params)
+        )
+        self._vehicle.call_later(_REPEAT_INTERVAL_S, lambda: self._send_until_confirmed(run_number, position))
 
 
 _COMPASSES, _ALL_COMPASSES = 3, 0b111
@@ -245,21 +246,21 @@ class Calibrations:
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
-        vehicle = self._vehicle
-        if command.x == _Accelerometers.FULL:
+        vehicle, kind = self._vehicle, command.x  # Param 5 of PREFLIGHT_CALIBRATION.
+        if kind == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
             # The gyros are calibrated first. Then the vehicle requests the first of the six positions.
             return CommandProgress(percents=(), interval_s=_GYRO_CALIBRATION_S, finish=self.accelerometers.start)
-        if command.x == _Accelerometers.TRIM:
+        if kind == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
             return CommandProgress(percents=(), interval_s=_TRIM_CALIBRATION_S, finish=lambda: vehicle.info(text))
-        if command.x == _Accelerometers.SIMPLE:
+        if kind == _Accelerometers.SIMPLE:
             if vehicle.now - self._simple_calibration_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED
             self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
             return CommandProgress(percents=(), interval_s=_ACCELEROMETER_CALIBRATION_S)
-        keeps_accelerometers = command.x == _ACCEPTS_PRESENT_CALIBRATION
+        keeps_accelerometers = kind == _ACCEPTS_PRESENT_CALIBRATION
         keeps_compasses = command.param2 == _ACCEPTS_PRESENT_CALIBRATION
         return MavResult.ACCEPTED if keeps_accelerometers or keeps_compasses else MavResult.UNSUPPORTED

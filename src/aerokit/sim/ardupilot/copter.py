@@ -48,9 +48,9 @@ class MotorTest:
 
     def command(self, command: ReceivedCommand) -> int:
         if not self.is_running:
-            obstacle = self._obstacle()
-            if obstacle is not None:
-                self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {obstacle}")
+            reason = self._reason_not_to_start()
+            if reason is not None:
+                self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {reason}")
                 return MavResult.FAILED
             self._copter.info("starting motor test")
         self.is_running = True
@@ -59,7 +59,7 @@ class MotorTest:
         self._copter.call_later(self._duration_s(command), partial(self._stop, self._test_number))
         return MavResult.ACCEPTED
 
-    def _obstacle(self) -> str | None:
+    def _reason_not_to_start(self) -> str | None:
         if not self._copter.is_initialised:
             return "Board initialising"
         return None if self._copter.is_landed else "vehicle not landed"
@@ -84,7 +84,7 @@ class MotorTest:
         if number == self._test_number:
             self.is_running = False
             self._copter.info("finished motor test")
-            self._copter.motors.set_armed(False, self._copter.now)
+            self._copter.motors.set_armed(armed=False)
 
 
 class CopterHold(CopterModeBase):

@@ -71,7 +71,7 @@ class _CircleLeg:
         self._approach: _FlyLeg | None = None  # None once the copter is on the circle
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
         if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - self._center_down) > _ON_CIRCLE_M:
-            self._approach = _FlyLeg(auto, self._point(), stops=True)
+            self._approach = _FlyLeg(auto, self._point_to_follow(), stops=True)
 
     @property
     def is_complete(self) -> bool:
@@ -91,7 +91,7 @@ class _CircleLeg:
         self._turned_rad += abs(rate) * dt
         self._report_new_turn()
         # Follow a point on the circle with the velocity of the point, plus 1 m/s for each metre of distance to it.
-        north, east, down = self._point()
+        north, east, down = self._point_to_follow()
         speed = rate * self._radius
         velocity_north = -speed * math.sin(self._angle)
         velocity_east = speed * math.cos(self._angle)
@@ -99,7 +99,7 @@ class _CircleLeg:
             north - motion.north + velocity_north, east - motion.east + velocity_east, down - motion.down
         )
 
-    def _point(self) -> Ned:
+    def _point_to_follow(self) -> Ned:
         north = self._center_north + self._radius * math.cos(self._angle)
         east = self._center_east + self._radius * math.sin(self._angle)
         return (north, east, self._center_down)
@@ -258,8 +258,8 @@ class CopterAuto(MissionMode):
         self._update_upcoming()  # so that `update` notices a later upload
 
     def update(self, dt: float) -> None:
-        self.start_if_waiting()
-        if not self.is_waiting:
+        self.start_if_origin_known()
+        if not self.is_waiting_for_origin:
             if self._update_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
                 self._restart_command()
             self.vehicle.mission.update()

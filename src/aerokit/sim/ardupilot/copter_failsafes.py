@@ -198,12 +198,15 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             # `BATTERY_PRIORITIES` begins with the most severe actions, TERMINATE and LAND.
             is_landing_for_battery = self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND)
             if self.battery_is_low and is_landing_for_battery:
-                return self._report_continuation(f"{name} + Battery", "Continuing Landing", _LAND)
+                self.warn(f"{name} + Battery Failsafe - Continuing Landing")
+                return _LAND
             if self._has_option(_CONTINUES_LANDING):
-                return self._report_continuation(name, "Continuing Landing", _LAND)
+                self.warn(f"{name} Failsafe - Continuing Landing")
+                return _LAND
         for option in options:
             if mode.name in option.modes and self._has_option(option.bit):
-                return self._report_continuation(name, option.text)
+                self.warn(f"{name} Failsafe - {option.text}")
+                return _NONE
         self.warn(f"{name} Failsafe")
         return action
 
@@ -212,7 +215,8 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             return
         continues_landing = self.vehicle.mode.is_landing and self._has_option(_CONTINUES_LANDING)
         if continues_landing and action != _NONE:
-            action = self._report_continuation("Battery", "Continuing Landing", _LAND)
+            self.warn("Battery Failsafe - Continuing Landing")
+            action = _LAND
         else:
             self.warn("Battery Failsafe")
         self._execute(action)
@@ -256,10 +260,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
 
     def _has_option(self, bit: int) -> bool:
         return bool(int(self.vehicle.parameters["FS_OPTIONS"]) & bit)
-
-    def _report_continuation(self, name: str, text: str, action: int = _NONE) -> int:
-        self.warn(f"{name} Failsafe - {text}")
-        return action
 
     def _disarm_if_landed(self, name: str) -> bool:
         copter = self.vehicle
@@ -320,7 +320,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[_FENCE_RTL])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        self.enter_first(modes)
+        self.enter_first_accepted(modes)
 
     def on_cleared(self) -> None:
         if not self.vehicle.is_landed:

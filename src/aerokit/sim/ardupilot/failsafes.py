@@ -296,7 +296,7 @@ class ArduPilotArming(Generic[HostT]):
             return
         self._was_always_armed = is_always_armed
         if is_always_armed != vehicle.motors.is_armed:
-            vehicle.motors.set_armed(is_always_armed, vehicle.now)
+            vehicle.motors.set_armed(armed=is_always_armed)
             vehicle.set_ticking(True)
 
     def arm(self, *, force: bool = False) -> bool:
@@ -313,7 +313,7 @@ class ArduPilotArming(Generic[HostT]):
         if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
             vehicle.navigation.set_home(vehicle.motion.place, lock=False)
         vehicle.info(self.ARMED_TEXT)
-        vehicle.motors.set_armed(True, vehicle.now)
+        vehicle.motors.set_armed(armed=True)
         vehicle.mode.enter(force=False)  # starts the mode, which was entered while the vehicle was disarmed
         vehicle.set_ticking(True)
         self.on_armed()
@@ -339,7 +339,7 @@ class ArduPilotArming(Generic[HostT]):
             return False
         vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)
-        vehicle.motors.set_armed(False, vehicle.now)
+        vehicle.motors.set_armed(armed=False)
         vehicle.mission.on_disarmed()
         return True
 

@@ -91,7 +91,7 @@ class ArduPilotFence(Generic[HostT]):
         enforced = present and self.enabled != 0 and self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY
         return present, enforced, not (present and self.breached)
 
-    def enable(self, on: bool, kinds: int = _ALL, *, by_command: bool = True) -> int:
+    def set_enabled(self, kinds: int, *, on: bool, by_command: bool = True) -> int:
         """Enable or disable those of ``kinds`` that are configured. Return the kinds that changed.
 
         ``by_command`` is False for an automatic change of the firmware.
@@ -112,27 +112,27 @@ class ArduPilotFence(Generic[HostT]):
         if command.param1 == 1.0:
             if not self.present & kinds:
                 return MavResult.FAILED
-            self.enable(True, kinds)
+            self.set_enabled(kinds, on=True)
         elif command.param1 == 0.0:
-            self.enable(False, kinds)
+            self.set_enabled(kinds, on=False)
         elif command.param1 == 2.0:
-            self.enable(False, _MIN_ALT)
+            self.set_enabled(_MIN_ALT, on=False)
         else:
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
     def on_armed(self) -> None:
-        if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
+        if self._parameter("FENCE_AUTOENABLE") == _WHEN_ARMED:
             self._floor_enabled_by_command = None
-            self.report("auto-enabled", self.enable(True, _ALL & ~_MIN_ALT, by_command=False))
+            self.report("auto-enabled", self.set_enabled(_ALL & ~_MIN_ALT, on=True, by_command=False))
 
     def on_disarmed(self) -> None:
-        if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
-            self.report("auto-disabled", self.enable(False, by_command=False))
+        if self._parameter("FENCE_AUTOENABLE") == _WHEN_ARMED:
+            self.report("auto-disabled", self.set_enabled(_ALL, on=False, by_command=False))
 
     def _follow_parameters(self) -> None:
         enable = int(self.vehicle.parameters["FENCE_ENABLE"])
-        auto_enable = int(self._value("FENCE_AUTOENABLE"))
+        auto_enable = int(self._parameter("FENCE_AUTOENABLE"))
         if (enable, auto_enable) != self._enabling_parameters:
             self._enabling_parameters = (enable, auto_enable)
             self.enabled = self.configured & ~_MIN_ALT if enable else 0
@@ -163,9 +163,9 @@ class ArduPilotFence(Generic[HostT]):
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
         is_floor_kept = self._floor_enabled_by_command is True  # A command enabled the floor.
         if may_be_low and not is_floor_kept and self.enabled & _MIN_ALT:
-            self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
+            self.report("auto-disabled", self.set_enabled(_MIN_ALT, on=False, by_command=False))
         new_breaches = 0
-        for kind, beyond_m in self._beyond(vehicle.motion.place).items():
+        for kind, beyond_m in self._distances_beyond(vehicle.motion.place).items():
             if self.active & kind and self._update_breach(kind, beyond_m):
                 new_breaches |= kind
         if not may_be_low:
@@ -185,7 +185,7 @@ class ArduPilotFence(Generic[HostT]):
         self._new_breach_m[kind] = beyond_m + (self.CIRCLE_BACKUP_M if kind == _CIRCLE else _BACKUP_M)
         return True
 
-    def _beyond(self, place: Ned) -> dict[int, float]:
+    def _distances_beyond(self, place: Ned) -> dict[int, float]:
         """Return the metres beyond the limit of each kind. They are negative within the limit."""
         parameters = self.vehicle.parameters
         home_north, home_east, home_down = self.vehicle.navigation.home or (0.0, 0.0, 0.0)
@@ -193,8 +193,8 @@ class ArduPilotFence(Generic[HostT]):
         height = home_down - down
         union = bool(int(parameters["FENCE_OPTIONS"]) & _UNION)
         return {
-            _MAX_ALT: height - self._value("FENCE_ALT_MAX"),
-            _MIN_ALT: self._value("FENCE_ALT_MIN") - height,
+            _MAX_ALT: height - self._parameter("FENCE_ALT_MAX"),
+            _MIN_ALT: self._parameter("FENCE_ALT_MIN") - height,
             _CIRCLE: math.hypot(north - home_north, east - home_east) - parameters["FENCE_RADIUS"],
             _POLYGON: self.zones.breach_m((north, east), union=union),
         }
@@ -205,13 +205,13 @@ class ArduPilotFence(Generic[HostT]):
         is_disabled_by_command = self._floor_enabled_by_command is False
         if not enables_floor or is_disabled_by_command or self.active & _MIN_ALT:
             return
-        floor = self._value("FENCE_ALT_MIN") + self.vehicle.parameters["FENCE_MARGIN"]
+        floor = self._parameter("FENCE_ALT_MIN") + self.vehicle.parameters["FENCE_MARGIN"]
         if self.vehicle.altitude_m >= floor:
-            self.enable(True, _MIN_ALT, by_command=False)
+            self.set_enabled(_MIN_ALT, on=True, by_command=False)
             self.vehicle.send_text(MavSeverity.NOTICE, "Min Alt fence enabled (auto enable)")
 
     def contains(self, place: Ned) -> bool:
-        return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
+        return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._distances_beyond(place).items())
 
     def _record_breach(self, kind: int) -> None:
         vehicle = self.vehicle
@@ -235,7 +235,7 @@ class ArduPilotFence(Generic[HostT]):
 
     def act(self, new_breaches: int) -> None: ...
 
-    def enter_first(self, modes: Sequence[int]) -> None:
+    def enter_first_accepted(self, modes: Sequence[int]) -> None:
         self.caused_mode = any(self.vehicle.set_mode(mode) for mode in modes)  # stops at the first accepted mode
 
     def on_cleared(self) -> None: ...
@@ -249,7 +249,7 @@ class ArduPilotFence(Generic[HostT]):
 
     def beyond_m(self, kinds: int) -> float:
         """Return the largest distance beyond the limits of ``kinds``."""
-        beyond = self._beyond(self.vehicle.motion.place)
+        beyond = self._distances_beyond(self.vehicle.motion.place)
         return max(beyond[kind] for kind in _NAMES if kinds & kind)
 
     def forbids_modes(self) -> bool:
@@ -263,7 +263,8 @@ class ArduPilotFence(Generic[HostT]):
             self._recovering_since = self.vehicle.now
             self.vehicle.info("Manual recovery started")
 
-    def _value(self, name: str) -> float:
+    def _parameter(self, name: str) -> float:
+        """Return a parameter, or its default if the vehicle does not have it."""
         return self.vehicle.parameters.get(name, _DEFAULTS[name])
 
     def report(self, event: str, kinds: int) -> None:
@@ -274,7 +275,7 @@ class ArduPilotFence(Generic[HostT]):
         self._follow_parameters()
         if self.vehicle.parameters["FENCE_ENABLE"] and not self.present:
             return "Fences enabled, but none selected"
-        may_be_enabled = self.enabled or self._value("FENCE_AUTOENABLE")
+        may_be_enabled = self.enabled or self._parameter("FENCE_AUTOENABLE")
         if not may_be_enabled or not self.configured:
             return None
         if self.configured & (_CIRCLE | _POLYGON) and self.vehicle.navigation.home is None:
@@ -285,7 +286,7 @@ class ArduPilotFence(Generic[HostT]):
         """Return (True if the check fails, text) for each check, in the order of the firmware."""
         parameters = self.vehicle.parameters
         radius, margin = parameters["FENCE_RADIUS"], parameters["FENCE_MARGIN"]
-        high, low = self._value("FENCE_ALT_MAX"), self._value("FENCE_ALT_MIN")
+        high, low = self._parameter("FENCE_ALT_MAX"), self._parameter("FENCE_ALT_MIN")
         # Uploaded circles belong to the kind POLYGON. The kind CIRCLE is the limit of the distance from home.
         has_small_circle = bool(self.configured & _POLYGON) and self.zones.smallest_inclusion_m < margin
         breached = f"Vehicle breaching {_joined_names(self.breached)}" if self.breached else ""

@@ -173,16 +173,16 @@ class ArduPilotMotors:
             return _STOPPED_PWM
         return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
 
-    def set_armed(self, armed: bool, now: float) -> None:
+    def set_armed(self, *, armed: bool) -> None:
         if self.is_armed and not armed:
-            self.disarmed_at = now
+            self.disarmed_at = self.vehicle.now
         self.is_armed = armed
-        self.armed_at = now
+        self.armed_at = self.vehicle.now
         self.may_turn = self.spool_up_requested = False
         self.spool = self.throttle = 0.0
 
-    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
-        self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
+    def update(self, dt: float, *, landed: bool) -> None:
+        self.may_turn = self.is_armed and self.vehicle.now - self.armed_at >= _ARMING_DELAY_S
         if self.may_turn and self.spool_up_requested:
             if self.spool < 1.0:
                 self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
@@ -191,7 +191,7 @@ class ArduPilotMotors:
         if landed or not self.is_armed:
             self.throttle = _IDLE_THROTTLE * self.spool
         else:
-            self.throttle = min(1.0, _HOVER_THROTTLE * motion.thrust_share)
+            self.throttle = min(1.0, _HOVER_THROTTLE * self.vehicle.motion.thrust_share)
 
 
 # The following classes are the interfaces through which the parts of a vehicle use each other.

@@ -57,7 +57,7 @@ class MissionMode(ArduPilotMode):
         self.may_lift_off: bool = False
         """True once MISSION_START or a raised throttle permits a take-off from the ground."""
         self.is_paused: bool = False
-        self.is_waiting: bool = False  # True from entering the mode until the mission starts.
+        self.is_waiting_for_origin: bool = False  # True until the mission starts, which needs the estimator's origin
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
     def on_disarmed(self) -> None:
@@ -66,18 +66,18 @@ class MissionMode(ArduPilotMode):
             self.vehicle.mission.update()
 
     def leave(self) -> None:
-        self.is_waiting = False
+        self.is_waiting_for_origin = False
         self.vehicle.mission.stop()
 
     def wait_for_origin(self) -> None:
         """Start the mission as soon as the estimator has an origin."""
-        self.is_waiting = True
-        self.vehicle.call_later(0.0, self.start_if_waiting)
+        self.is_waiting_for_origin = True
+        self.vehicle.call_later(0.0, self.start_if_origin_known)
 
-    def start_if_waiting(self) -> None:
+    def start_if_origin_known(self) -> None:
         vehicle = self.vehicle
-        if self.is_waiting and vehicle.mode is self and vehicle.navigation.origin is not None:
-            self.is_waiting = False
+        if self.is_waiting_for_origin and vehicle.mode is self and vehicle.navigation.origin is not None:
+            self.is_waiting_for_origin = False
             vehicle.mission.start_or_resume()
             self.on_mission_started()
 
@@ -176,7 +176,7 @@ class MissionRun:
 
     def _next_navigation(self, index: int) -> MissionCommand | None:
         for _ in range(1 + _MAX_STEPS):
-            command = self._next(index, count_jumps=False)
+            command = self._next_command(index, count_jumps=False)
             if command is None or is_navigation(command.item):
                 return command
             index = command.seq + 1
@@ -247,7 +247,7 @@ class MissionRun:
         Return False if there is no such command.
         """
         for _ in range(_MAX_STEPS):
-            command = self._next(index, count_jumps=True)
+            command = self._next_command(index, count_jumps=True)
             if command is None:
                 break
             if is_navigation(command.item):
@@ -286,35 +286,35 @@ class MissionRun:
         self._running_do = None
         self._last_do_index = 0
         for _ in range(_MAX_STEPS):
-            command = self._next(index, count_jumps=True)
+            command = self._next_command(index, count_jumps=True)
             if command is None:
                 return False
             index = command.seq + 1
             if is_navigation(command.item):
                 self.nav_index = command.seq
-                is_supported = self._begin(*command)
+                is_supported = self._start_command(*command)
                 if is_supported:  # An unsupported command is skipped.
                     self._running_nav = command.item
                     return True
             elif self._running_do is None:
-                self._begin_do(command)
+                self._start_do(command)
         return False
 
     def _start_next_do(self) -> None:
         if not self._last_do_index:
             return
-        command = self._next(self._last_do_index + 1, count_jumps=False)
+        command = self._next_command(self._last_do_index + 1, count_jumps=False)
         if command is None or is_navigation(command.item):
             self._last_do_index = 0
             return
-        self._begin_do(command)
+        self._start_do(command)
 
-    def _begin_do(self, command: MissionCommand) -> None:
+    def _start_do(self, command: MissionCommand) -> None:
         self._running_do = command
         self._last_do_index = command.seq
-        self._begin(*command)
+        self._start_command(*command)
 
-    def _begin(self, index: int, item: MissionItem) -> bool:
+    def _start_command(self, index: int, item: MissionItem) -> bool:
         """Start a command. Return False if the vehicle does not support it."""
         name = command_name(item.command)
         target = f" {item.param1:.0f}" if item.command in _WITH_TARGET else ""
@@ -329,7 +329,7 @@ class MissionRun:
         self._state = MissionState.COMPLETE
         self._mode.end_mission()
 
-    def _next(self, index: int, *, count_jumps: bool) -> MissionCommand | None:
+    def _next_command(self, index: int, *, count_jumps: bool) -> MissionCommand | None:
         """Return the first command at or after ``index``. Jump commands are followed, not returned.
 
         With ``count_jumps``, each followed jump uses up one of its repetitions.

@@ -63,8 +63,8 @@ class PlaneEngine(ArduPilotMotors):
     def current_a(self) -> float:
         return self.throttle * _FULL_AMPERES
 
-    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
-        self.throttle: float = motion.throttle if self.is_armed and not landed else 0.0
+    def update(self, dt: float, *, landed: bool) -> None:
+        self.throttle: float = self.vehicle.motion.throttle if self.is_armed and not landed else 0.0
         self.spool: float = self.throttle
 
 

@@ -302,5 +302,5 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         return int(self.vehicle.parameters["FENCE_ACTION"])
 
     def _turn_back(self, mode_before: int, *modes: int) -> None:
-        self.enter_first(modes)
+        self.enter_first_accepted(modes)
         self._mode_before = mode_before

@@ -84,7 +84,7 @@ class PlaneLanding:
     def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
         self._plane = plane
         self.point: Ned = point
-        self._fly_to_first = start  # Place to fly to before the approach; None once the approach has begun.
+        self._unreached_start = start  # Place to fly to before the approach; None once the approach has begun.
         self._approach_start: Ned = plane.wing.place
         self._is_flaring = False
         self._is_distance_reported = False
@@ -96,8 +96,8 @@ class PlaneLanding:
             self._disarm_after_stop()
         elif wing.is_on_ground:  # The plane has touched down, but still rolls.
             wing.roll_out()
-        elif self._fly_to_first is not None:
-            self._fly_to_start(self._fly_to_first)
+        elif self._unreached_start is not None:
+            self._fly_to_start(self._unreached_start)
         else:
             self._approach()
 
@@ -106,7 +106,7 @@ class PlaneLanding:
         _, _, down = start
         if wing.distance_to(start) < _JOINED_M and abs(wing.down - down) < _JOINED_M / 4:
             self._approach_start = wing.place
-            self._fly_to_first = None
+            self._unreached_start = None
             return
         wing.fly_to(*start, airspeed=self._plane.cruise_m_s)
 

@@ -226,7 +226,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
         elif action == _TERMINATE:
             vehicle.arming.disarm()
         else:
-            self.enter_first(_MODES.get(action, ()))
+            self.enter_first_accepted(_MODES.get(action, ()))
 
     def on_mode_changed(self) -> None:
         super().on_mode_changed()
@@ -273,7 +273,8 @@ class RoverMotors(ArduPilotMotors):
     def current_a(self) -> float:
         return abs(self.throttle) * _AMPERES_AT_FULL
 
-    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
+    def update(self, dt: float, *, landed: bool) -> None:
+        motion = self.vehicle.motion
         self.throttle: float = max(-1.0, min(1.0, motion.speed_m_s / motion.wheels.top_speed_m_s / 2.0))
         if not self.is_armed:
             self.throttle = 0.0

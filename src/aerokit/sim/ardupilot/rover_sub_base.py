@@ -170,7 +170,7 @@ class RoverSubVehicle(ArduPilotVehicle):
     def tick(self, dt: float) -> None:
         if self.motors.is_armed:
             self.mode.update(dt)
-        self.motors.update(self.now, dt, self.motion, landed=False)  # Rovers and submarines do not land.
+        self.motors.update(dt, landed=False)  # Rovers and submarines do not land.
         self.move(dt)
         self.battery.drain(self.motors.current_a, dt)
         if not self.motors.is_armed and self.is_at_rest:
@@ -257,8 +257,8 @@ class RoverSubAuto(MissionMode):
         return True
 
     def update(self, dt: float) -> None:
-        self.start_if_waiting()
-        if not self.is_waiting:
+        self.start_if_origin_known()
+        if not self.is_waiting_for_origin:
             self.vehicle.mission.update()
         if self.vehicle.mode is not self:  # The mission has changed the mode.
             return

@@ -50,7 +50,7 @@ class ArduPilotLogServer(LogServer):
         return f"{self.FOLDER}/{index + 1:08}.BIN"
 
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:
-        if self._refuses():
+        if self._refuses_while_armed():
             return
         if self.is_busy:
             self._vehicle.info("Log download in progress")
@@ -69,19 +69,19 @@ class ArduPilotLogServer(LogServer):
 
     def _on_data(self, request: LogRequestData, channel: Channel) -> None:
         is_known = 1 <= request.id <= len(self.logs)
-        if self._refuses() or self.is_busy or not is_known:
+        if self._refuses_while_armed() or self.is_busy or not is_known:
             return
         self.transfer(self.blocks(request.id - 1, request.id, request.ofs, request.count), channel)
 
     def _on_erase(self, request: LogErase, channel: Channel) -> None:
-        if not self._refuses():
+        if not self._refuses_while_armed():
             super()._on_erase(request, channel)
 
     def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
-        if not self._refuses():
+        if not self._refuses_while_armed():
             super()._on_end(request, channel)
 
-    def _refuses(self) -> bool:
+    def _refuses_while_armed(self) -> bool:
         armed = self._ardupilot.is_armed
         if armed and not self._has_warned:
             self._vehicle.send_text(MavSeverity.ERROR, "Disarm for log download")

@@ -225,8 +225,8 @@ class SubMotors(ArduPilotMotors):
         thrust = abs(2.0 * self.throttle - 1.0) if follows_stick else self.throttle
         return float(thrust**2.7) * _AMPERES_AT_FULL
 
-    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
-        throttle = _HOLDING_THROTTLE - _THROTTLE_PER_CLIMB_M_S * motion.velocity_down
+    def update(self, dt: float, *, landed: bool) -> None:
+        throttle = _HOLDING_THROTTLE - _THROTTLE_PER_CLIMB_M_S * self.vehicle.motion.velocity_down
         if self.vehicle.mode.has_manual_throttle:
             throttle = (self.vehicle.rc[RC_THROTTLE] - 1000) / 1000.0
         self.throttle: float = max(0.0, min(1.0, throttle)) if self.is_armed else 0.0

@@ -355,7 +355,7 @@ class ArduPilotVehicle(ArduPilotHost):
     def tick(self, dt: float) -> None:
         if self.motors.is_armed:
             self.mode.update(dt)
-        self.motors.update(self.now, dt, self.motion, landed=self.is_landed)
+        self.motors.update(dt, landed=self.is_landed)
         if not self.is_landed:
             self.move(dt)
         self.battery.drain(self.motors.current_a, dt)

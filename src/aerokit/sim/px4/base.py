@@ -322,9 +322,9 @@ class Px4Vehicle(Px4Host):
         self._touchdown_at = math.nan
         self.info("Takeoff detected")
 
-    def on_sticks_moved(self, size: float) -> None:
+    def on_sticks_moved(self, distance: float) -> None:
         """Switch to POSITION if the sticks moved far enough and the present mode can be overridden."""
-        if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(size):
+        if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(distance):
             self.info("Pilot took over using sticks")
             self.change_mode(modes.POSITION)
 

@@ -110,7 +110,7 @@ _BEFORE_INT32_MAX, _AFTER_INT32_MAX = 2.0**31 - 128, 2.0**31 + 256
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    flight = _Flight(px4)
+    flight = _FlightCommands(px4)
     return {
         **message_requests(px4),
         **other_commands(px4),
@@ -171,7 +171,7 @@ def _change(px4: Px4Vehicle, mode: Px4Mode) -> int:
     return MavResult.TEMPORARILY_REJECTED
 
 
-class _Flight:
+class _FlightCommands:
     """Handlers of the commands that arm, move or restart the vehicle."""
 
     def __init__(self, px4: Px4Vehicle) -> None:
@@ -374,7 +374,7 @@ _ACKNOWLEDGED_ONLY = frozenset({m.Heartbeat.ID})
 
 
 def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    requests = _Requests(px4)
+    requests = _MessageRequests(px4)
     handlers: dict[int, CommandHandler] = {
         Cmd.REQUEST_MESSAGE: requests.request_message,
         Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
@@ -395,7 +395,7 @@ _LEGACY_REQUESTS = {
 }
 
 
-class _Requests:
+class _MessageRequests:
     """Handlers of the commands that request messages once or periodically."""
 
     def __init__(self, px4: Px4Vehicle) -> None:

@@ -283,10 +283,10 @@ class Px4Failsafes:
             self._px4.arming.report_changes()
             self._reset()
             return
-        self._update(self._active_failures())
-        self._execute(self._choose())
+        self._update_active_failures(self._active_failures())
+        self._execute(self._choose_action())
 
-    def _update(self, failing: dict[str, FailsafeAction]) -> None:
+    def _update_active_failures(self, failing: dict[str, FailsafeAction]) -> None:
         """Update the active failures. ``failing`` maps the present failures to their actions."""
         for cause, action in failing.items():
             # A new failure ends an override by the user.
@@ -302,7 +302,7 @@ class Px4Failsafes:
         self._active = {**still_acting, **failing}
         self._failing = frozenset(failing)
 
-    def _choose(self) -> FailsafeAction:
+    def _choose_action(self) -> FailsafeAction:
         """Return the action to execute because of the worst failure."""
         worst = max(self._active.values(), default=Action.NONE)
         can_hold = self._px4.has_position

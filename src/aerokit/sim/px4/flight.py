@@ -155,7 +155,7 @@ class Px4Flight:
         elif mode == modes.TERMINATION:
             pass  # The motors are off.
         else:
-            self.go()
+            self.fly_to_target()
 
     def _lift_off(self) -> None:
         vehicle = self._vehicle
@@ -193,13 +193,13 @@ class Px4Flight:
             altitude = self._vehicle.parameters["MIS_TAKEOFF_ALT"]
             self._vehicle.info(f"Using default takeoff altitude: {altitude:.1f} m")
 
-    def go(self) -> None:
+    def fly_to_target(self) -> None:
         vehicle, limits = self._vehicle, self._vehicle.parameters
         climb, descent = limits["MPC_Z_V_AUTO_UP"], limits["MPC_Z_V_AUTO_DN"]
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=descent)
-        self._point()
+        self._turn_nose()
 
-    def _point(self) -> None:
+    def _turn_nose(self) -> None:
         motion = self._vehicle.motion
         if self.heading is not None:
             motion.face(self.heading)
@@ -238,7 +238,7 @@ class Px4Flight:
         if self._phase == "land":
             self.descend()
             return
-        self.go()
+        self.fly_to_target()
         if math.dist(self.target, motion.place) > _ARRIVED_M:
             return
         # In the phase "climb", the vehicle has arrived above its starting point. In the phase "return", it has arrived

@@ -65,7 +65,7 @@ class Px4FlightInterface(Protocol):
     @property
     def top_speed_m_s(self) -> float: ...
     def stay_here(self) -> None: ...
-    def go(self) -> None: ...
+    def fly_to_target(self) -> None: ...
     def descend(self) -> None: ...
 
 
@@ -165,6 +165,6 @@ class Px4Host(SimulatedAutopilot):
         """Called after disarming."""
         raise NotImplementedError
 
-    def on_sticks_moved(self, size: float) -> None:
+    def on_sticks_moved(self, distance: float) -> None:
         """Called with the distance by which a stick has moved. 2 is the distance from end to end."""
         raise NotImplementedError

@@ -310,12 +310,12 @@ class Px4Mission:
     def update(self) -> None:
         item, flight = self._item, self._px4.flight
         if item is None or self.is_finished:
-            flight.go()
+            flight.fly_to_target()
             return
         if self._phase == "land":
             flight.descend()
             return
-        flight.go()
+        flight.fly_to_target()
         if not self._is_at_target(item):
             return
         if self._phase == "climb":
