@@ -18,7 +18,7 @@ from aerokit.protocols.servers.ftp import SessionFtpServer
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
 from aerokit.sim.logs import LogServer
-from aerokit.sim.motion import Motion
+from aerokit.sim.motion import LocalFrame, Motion
 from aerokit.sim.parameter_server import ParameterServer
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
@@ -196,7 +196,10 @@ class SimulatedAutopilot(SimulatedVehicle):
     """Protocol servers of files, logs and parameters."""
     signing: VehicleSigning
     """Message signing, whose key survives a reboot."""
+    frame: LocalFrame
+    """The world frame, which counts metres north and east of the power-on location."""
     motion: Motion
+    battery: SimulatedBattery
     parameters: SimParameters
     """Parameters by name. A test may change them, and they survive a reboot."""
 
@@ -273,6 +276,11 @@ class SimulatedAutopilot(SimulatedVehicle):
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
         """Return the MAV_RESULT with which this command is refused before it is handled; None to handle it."""
         return None
+
+    def send_command(self, target: tuple[int, int], command: int, param1: float = 0.0) -> None:
+        """Send a COMMAND_LONG. ``target`` is (system id, component id); 0 selects all of them."""
+        confirmation, unused_params = 0, (0.0,) * 6
+        self.send(m.CommandLong(*target, command, confirmation, param1, *unused_params))
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
         if request.tc1 == 0:

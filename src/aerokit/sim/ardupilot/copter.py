@@ -231,19 +231,14 @@ class SimulatedCopter(CopterHost):
 
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds, and detect the landing."""
-        motion = self.motion
-        was_on_ground = motion.is_on_ground
-        motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
-        is_on_ground = motion.is_on_ground
-        if is_on_ground and not was_on_ground:
-            self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
+        super().move(dt)
         keeps_flying = self.motors.is_armed and (self.mode.is_taking_off or not self.mode.notices_landing)
-        on_ground_for = self._on_ground_timer.seconds(is_on_ground and not keeps_flying, self.now)
+        on_ground_for = self._on_ground_timer.seconds(self.motion.is_on_ground and not keeps_flying, self.now)
         # An armed copter counts as landed `_LAND_DETECTOR_S` after the touchdown, a disarmed copter at once.
         if on_ground_for >= _LAND_DETECTOR_S or (on_ground_for > 0.0 and not self.motors.is_armed):
             self.is_landed: bool = True
             self._on_ground_timer.reset()
-            motion.settle()
+            self.motion.settle()
 
     def _take_off(self, command: ReceivedCommand) -> int:
         if command.altitude_frame != MavFrame.GLOBAL_RELATIVE_ALT:

@@ -14,11 +14,11 @@ from aerokit.mavlink.enums import MavFrame, MavSeverity
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import BootTimeline, Kind
 from aerokit.sim.ardupilot.mission_lists import CommandList
-from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
+from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import rotated
 from aerokit.sim.missions import MissionStore
-from aerokit.sim.motion import LocalFrame, Ned
+from aerokit.sim.motion import Ned
 
 RC_ROLL, RC_PITCH, RC_THROTTLE, RC_YAW = range(4)
 """Indices of the RC channels of the sticks, in ArduPilot's default RCMAP."""
@@ -301,10 +301,7 @@ class ArduPilotHost(SimulatedAutopilot):
 
     timeline: BootTimeline
     uid: bytes
-    battery: SimulatedBattery
     motors: ArduPilotMotors
-    frame: LocalFrame
-    """The world frame, which counts metres north and east of the power-on location."""
     mode: ArduPilotMode
     is_initialised: bool
     is_landed: bool

@@ -160,16 +160,12 @@ class SimulatedPlane(PlaneHost):
 
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds. A plane that rests for a while counts as landed."""
-        wing = self.wing
-        was_on_ground = wing.is_on_ground
-        wing.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
-        if wing.is_on_ground and not was_on_ground:
-            self.info(f"SIM Hit ground at {wing.impact_speed_m_s:f} m/s")
-        is_resting = wing.is_at_rest and wing.throttle <= 0
+        super().move(dt)
+        is_resting = self.wing.is_at_rest and self.wing.throttle <= 0
         rested_for_s = self.rest_timer.seconds(is_resting, self.now)
         if rested_for_s >= _MIN_REST_S:
             self.is_landed: bool = True
-            wing.settle()  # stops the motion model
+            self.wing.settle()  # stops the motion model
 
     def _terminate(self, command: ReceivedCommand) -> int:
         # Termination is refused, because it needs the advanced failsafe, which is not simulated.

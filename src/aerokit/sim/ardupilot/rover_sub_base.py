@@ -176,9 +176,6 @@ class RoverSubVehicle(ArduPilotVehicle):
         if not self.motors.is_armed and self.is_at_rest:
             self.set_ticking(False)
 
-    def move(self, dt: float) -> None:
-        self.motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
-
     def make_commands(self) -> dict[int, CommandHandler]:
         return {**common_commands(self), Cmd.DO_CHANGE_SPEED: self._change_speed}
 

@@ -222,8 +222,12 @@ class ArduPilotVehicle(ArduPilotHost):
         raise NotImplementedError
 
     def move(self, dt: float) -> None:
-        """Advance the motion by one tick."""
-        raise NotImplementedError
+        """Move for ``dt`` seconds, and report a touchdown."""
+        motion = self.motion
+        was_on_ground = motion.is_on_ground
+        motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
+        if motion.is_on_ground and not was_on_ground:
+            self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
 
     def is_addressed(self, message: Message) -> bool:
         """Return True unless a message is for another system, or for one of the other `components` of this vehicle.

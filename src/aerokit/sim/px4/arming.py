@@ -8,7 +8,6 @@ from datetime import datetime, timezone
 from functools import partial
 
 from aerokit.mavlink.enums import MavCmd, MavComponent, MavResult, MavSeverity, ParachuteAction
-from aerokit.mavlink.messages import CommandLong
 from aerokit.sim.commands import ReceivedCommand
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.host import Px4Host
@@ -252,12 +251,8 @@ class Px4Arming:
         px4.is_in_failsafe = True
         px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
         px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")
-        release, unused_params, confirmation = float(ParachuteAction.RELEASE), (0.0,) * 6, 0
-        px4.send(
-            CommandLong(
-                px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, confirmation, release, *unused_params
-            )
-        )
+        parachute = (px4.system_id, MavComponent.PARACHUTE)
+        px4.send_command(parachute, MavCmd.DO_PARACHUTE, float(ParachuteAction.RELEASE))
 
     def start_log(self) -> None:
         if self._is_logging:

@@ -311,10 +311,8 @@ class Px4Vehicle(Px4Host):
         self.mode = mode
         self.flight.enter(mode)
         if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle about a return.
-            all_components, confirmation, unused_params = 0, 0, (0.0,) * 7
-            self.send(
-                m.CommandLong(self.system_id, all_components, MavCmd.NAV_RETURN_TO_LAUNCH, confirmation, *unused_params)
-            )
+            all_components = 0
+            self.send_command((self.system_id, all_components), MavCmd.NAV_RETURN_TO_LAUNCH)
 
     def leave_ground(self) -> None:
         self.is_landed = False

@@ -11,9 +11,9 @@ from typing import ClassVar, Protocol
 
 from aerokit.mavlink.enums import MavFrame
 from aerokit.missions import MissionItem
-from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
+from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.channel import Channel
-from aerokit.sim.motion import LocalFrame, Ned
+from aerokit.sim.motion import Ned
 from aerokit.sim.px4.modes import Px4Mode
 
 
@@ -106,8 +106,6 @@ class Px4Host(SimulatedAutopilot):
 
     VEHICLE_TYPE: ClassVar[int]
 
-    frame: LocalFrame
-    battery: SimulatedBattery
     home: Ned
     mode: Px4Mode
     intended_mode: Px4Mode
