@@ -132,8 +132,8 @@ def _type_of(path: str) -> int:
 
 
 _POLYGON_INCLUSION, _CIRCLE_INCLUSION = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_INCLUSION
-_POLYGONS = (_POLYGON_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
-_CIRCLES = (_CIRCLE_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_EXCLUSION)
+POLYGON_CORNERS = (_POLYGON_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
+CIRCLES = (_CIRCLE_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_EXCLUSION)
 Point = tuple[float, float]
 
 
@@ -150,9 +150,9 @@ class FenceZones:
             is_inclusion = item.command in (_POLYGON_INCLUSION, _CIRCLE_INCLUSION)
             zones = self._inclusions if is_inclusion else self._exclusions
             count = 1  # number of items of this zone
-            if item.command in _CIRCLES:
+            if item.command in CIRCLES:
                 zones.append(CircleZone(places[index], item.param1))
-            elif item.command in _POLYGONS:
+            elif item.command in POLYGON_CORNERS:
                 count = max(1, int(item.param1))  # Param 1 of each corner is the number of corners.
                 zones.append(PolygonZone(places[index : index + count]))
             index += count

@@ -94,6 +94,7 @@ class ArduPilotParameterServer(ParameterServer):
             self._vehicle.call_later(0.0, self._read_next)
 
     def _read_next(self) -> None:
+        """Answer the oldest request, and call this method again a moment later if there was one."""
         self._is_reading = bool(self._reads)
         if not self._reads:
             return

@@ -192,6 +192,7 @@ def _lines_and_switches(
     switches = {name: switch for name, switch in all_switches.items() if switch is not None}
     if count is None:
         return lines, switches, frozenset()
+    # The parameters that need a switch are among those that are not listed, so no switch is needed.
     listed = [name for name in lines if name not in switches][:count]
     return lines, {}, frozenset(lines).difference(listed)
 
@@ -273,7 +274,7 @@ class _Reader(FileHandle):
 
 
 class _Writer(UploadedFile):
-    """Upload of parameters, which are applied on close. An invalid file has no effect, and no text reports it."""
+    """Upload of parameters, which are applied on close, up to the first invalid entry. No text reports the failure."""
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
         super().__init__()

@@ -224,20 +224,13 @@ class ArduPilotGimbal:
         if not self.is_fitted:
             return None
         roll, pitch, yaw = map(math.radians, self.angles)
+        unknown = math.nan
         return m.GimbalDeviceAttitudeStatus(
-            target_system=0,  # broadcast
-            target_component=0,
-            time_boot_ms=self._vehicle.time_boot_ms,
-            flags=_device_flags(self),
-            q=quaternion_from_euler(roll, pitch, yaw),
-            angular_velocity_x=math.nan,  # NaN means unknown.
-            angular_velocity_y=math.nan,
-            angular_velocity_z=math.nan,
-            failure_flags=0,
-            delta_yaw=math.nan,
-            delta_yaw_velocity=math.nan,
+            target_system=0, target_component=0, time_boot_ms=self._vehicle.time_boot_ms, flags=_device_flags(self),
+            q=quaternion_from_euler(roll, pitch, yaw), angular_velocity_x=unknown, angular_velocity_y=unknown,
+            angular_velocity_z=unknown, failure_flags=0, delta_yaw=unknown, delta_yaw_velocity=unknown,
             gimbal_device_id=_DEVICE_ID,
-        )
+        )  # fmt: skip
 
     def manager_information(self) -> m.GimbalManagerInformation | None:
         if not self.is_fitted:

@@ -15,7 +15,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.mission_items import altitude_frame, as_stored, check_place
 from aerokit.sim.commands import to_int
-from aerokit.sim.missions import float32
+from aerokit.sim.missions import CIRCLES, POLYGON_CORNERS, float32
 
 _MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767
 _HOME_SEQ = 0
@@ -199,8 +199,6 @@ def _stored_rally_point(item: MissionItem) -> MissionItem | int:
     return MissionItem(item.command, frame, x=int(item.x), y=int(item.y), z=height, autocontinue=False)
 
 
-_POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
-_CIRCLES = (Cmd.NAV_FENCE_CIRCLE_INCLUSION, Cmd.NAV_FENCE_CIRCLE_EXCLUSION)
 _TYPE_NUMBERS: dict[int, int] = {
     Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: 98,
     Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: 97,
@@ -290,11 +288,11 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
     if item.frame == MavFrame.MISSION or altitude_frame(item.frame) is None:
         return MavMissionResult.UNSUPPORTED_FRAME
     size = 0.0
-    if item.command in _POLYGONS:
+    if item.command in POLYGON_CORNERS:
         if item.param1 > _MAX_VERTICES:
             return MavMissionResult.INVALID_PARAM1
         size = float(to_int(item.param1) & 0xFF)  # The number of vertices is stored in one byte.
-    elif item.command in _CIRCLES:
+    elif item.command in CIRCLES:
         size = float32(item.param1)
     elif item.command != Cmd.NAV_FENCE_RETURN_POINT:
         return MavMissionResult.UNSUPPORTED
@@ -308,7 +306,7 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
     missing = 0  # number of vertices that must still follow
     has_return_point = False
     for item in items:
-        if item.command in _POLYGONS:
+        if item.command in POLYGON_CORNERS:
             if item.param1 < 3:
                 return f"Invalid vertex count ({item.param1:.0f})"
             if missing == 0:
@@ -322,7 +320,7 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
             missing -= 1
         elif missing:
             return f"Received incorrect type (want={_number(polygon_type)} got={_number(item.command)})"
-        elif item.command in _CIRCLES and not item.param1 > 0:
+        elif item.command in CIRCLES and not item.param1 > 0:
             return "Non-positive circle radius"
         elif item.command == Cmd.NAV_FENCE_RETURN_POINT:
             if has_return_point:
@@ -345,9 +343,9 @@ def _storage_needed(items: Sequence[MissionItem]) -> int:
             vertices_left -= 1
             continue
         size += 1  # One byte for the type of a polygon, circle or return point.
-        if item.command in _POLYGONS:
+        if item.command in POLYGON_CORNERS:
             size += 1  # One byte for the number of vertices.
             vertices_left = int(item.param1) - 1
-        elif item.command in _CIRCLES:
+        elif item.command in CIRCLES:
             size += 4  # Four bytes for the radius.
     return size

@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import MavFrame as Frame
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavRoi
 from aerokit.missions import MissionItem
 from aerokit.sim.commands import to_int
-from aerokit.sim.missions import float32
+from aerokit.sim.missions import POLYGON_CORNERS, float32
 
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
 assert _DATA is not None
@@ -29,9 +29,8 @@ _ROI_WITH_PLACE = (MavRoi.NONE, MavRoi.LOCATION)
 _ROI_WITHOUT_PLACE = (MavRoi.NONE, MavRoi.WPNEXT, MavRoi.WPINDEX)
 _INT_FRAMES: dict[int, int] = {Frame.GLOBAL_INT: Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT_INT: Frame.GLOBAL_RELATIVE_ALT}
 _AS_INT = {plain: int_frame for int_frame, plain in _INT_FRAMES.items()}
-_POLYGONS = (Cmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, Cmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
 _NO_MISSION_COMMANDS = frozenset(
-    {*_POLYGONS, Cmd.NAV_FENCE_CIRCLE_INCLUSION, Cmd.NAV_FENCE_CIRCLE_EXCLUSION, Cmd.NAV_RALLY_POINT}
+    {*POLYGON_CORNERS, Cmd.NAV_FENCE_CIRCLE_INCLUSION, Cmd.NAV_FENCE_CIRCLE_EXCLUSION, Cmd.NAV_RALLY_POINT}
 )
 _INT_MIN = -(1 << 31)
 _PI = float32(math.pi)
@@ -56,7 +55,7 @@ def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> M
     if mission_type == MavMissionType.MISSION and stored_item.command in _NO_MISSION_COMMANDS:
         return MavMissionResult.ERROR
     if mission_type == MavMissionType.FENCE:
-        if stored_item.command in _POLYGONS and stored_item.param1 < 3:
+        if stored_item.command in POLYGON_CORNERS and stored_item.param1 < 3:
             return MavMissionResult.ERROR
         return _as_fence_point(stored_item)
     return stored_item
