@@ -10,7 +10,7 @@ GIMBAL_MANAGER_SET_PITCHYAW is ignored. When a return starts, PX4 briefly takes 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from functools import partial
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
@@ -166,16 +166,17 @@ class Px4Gimbal:
 _SELF, _RELEASE = -2, -3
 
 
-def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
-    def if_fitted(handler: Callable[[Px4Gimbal, ReceivedCommand], int]) -> CommandHandler:
-        # Without a gimbal, most commands are not answered.
-        return lambda command: handler(gimbal, command) if gimbal.is_fitted else None
+def _if_fitted(device: Px4Gimbal | Px4CameraTrigger, handler: CommandHandler) -> CommandHandler:
+    """Return a handler that does not answer a command while the device is not fitted."""
+    return lambda command: handler(command) if device.is_fitted else None
 
+
+def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
     return {
-        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: if_fitted(_configure),
-        MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: if_fitted(_pitch_and_yaw),
-        MavCmd.DO_MOUNT_CONTROL: if_fitted(_control_mount),
-        MavCmd.DO_MOUNT_CONFIGURE: if_fitted(lambda *_: MavResult.ACCEPTED),
+        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: _if_fitted(gimbal, partial(_configure, gimbal)),
+        MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: _if_fitted(gimbal, partial(_pitch_and_yaw, gimbal)),
+        MavCmd.DO_MOUNT_CONTROL: _if_fitted(gimbal, partial(_control_mount, gimbal)),
+        MavCmd.DO_MOUNT_CONFIGURE: _if_fitted(gimbal, lambda _: MavResult.ACCEPTED),
         MavCmd.DO_SET_ROI_LOCATION: lambda command: _set_roi(gimbal, command),
         MavCmd.DO_SET_ROI_NONE: lambda _: _set_roi(gimbal, None),
     }
@@ -269,14 +270,12 @@ class Px4CameraTrigger:
 
     def commands(self) -> dict[int, CommandHandler]:
         return {
-            MavCmd.DO_DIGICAM_CONTROL: self._digicam_control,
-            MavCmd.DO_TRIGGER_CONTROL: self._enable_or_pause,
-            MavCmd.DO_SET_CAM_TRIGG_INTERVAL: self._set_interval,
+            MavCmd.DO_DIGICAM_CONTROL: _if_fitted(self, self._digicam_control),
+            MavCmd.DO_TRIGGER_CONTROL: _if_fitted(self, self._enable_or_pause),
+            MavCmd.DO_SET_CAM_TRIGG_INTERVAL: _if_fitted(self, self._set_interval),
         }
 
-    def _digicam_control(self, command: ReceivedCommand) -> int | None:
-        if not self.is_fitted:
-            return None
+    def _digicam_control(self, command: ReceivedCommand) -> int:
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.
             return MavResult.TEMPORARILY_REJECTED
         takes_image = command.x == 1  # Param 5 of DO_DIGICAM_CONTROL.
@@ -284,9 +283,7 @@ class Px4CameraTrigger:
             self.shoot()
         return MavResult.ACCEPTED
 
-    def _enable_or_pause(self, command: ReceivedCommand) -> int | None:
-        if not self.is_fitted:
-            return None
+    def _enable_or_pause(self, command: ReceivedCommand) -> int:
         was_running = self.is_running
         # A param of -1 changes nothing.
         enable, reset, pause = to_int(command.param1), to_int(command.param2), to_int(command.param3)
@@ -301,9 +298,7 @@ class Px4CameraTrigger:
             self._take_next(self._series_number)
         return MavResult.ACCEPTED
 
-    def _set_interval(self, command: ReceivedCommand) -> int | None:
-        if not self.is_fitted:
-            return None
+    def _set_interval(self, command: ReceivedCommand) -> int:
         if command.param1 > 0.0:
             self.interval_s = command.param1 / 1000.0
         return MavResult.ACCEPTED
