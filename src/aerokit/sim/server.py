@@ -240,6 +240,7 @@ class SimulatorServer:
             port.disconnect_clients()
 
     def _schedule(self) -> None:
+        """Set the timer to the next event of all vehicles."""
         loop = self._loop
         if loop is None or self._remove_source is not None:  # An event source needs no timer.
             return
@@ -258,6 +259,7 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
+        """Skip simulated time if the computer is too slow for the speedup, so that the lateness does not grow."""
         has_nothing_scheduled = self._timer is None and self._remove_source is None
         if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return

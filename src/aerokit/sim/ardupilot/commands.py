@@ -294,9 +294,7 @@ class HomeAndOrigin:
         point = vehicle.world_point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
         if point is None or place == (0, 0) or not vehicle.navigation.set_origin(point):
             return
-        origin = vehicle.build(m.GpsGlobalOrigin.ID)
-        if origin is not None:
-            vehicle.send(origin, channel)
+        vehicle.send_built(m.GpsGlobalOrigin.ID, channel)
 
 
 _PLAIN_MOUNT_MODES = frozenset(

@@ -264,7 +264,7 @@ class SimulatedCopter(CopterHost):
         if not mode.can_change_speed:
             return MavResult.FAILED
         if command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
-            mode.speed = speed  # type: ignore[attr-defined]
+            mode.speed = speed
             return MavResult.ACCEPTED
         is_vertical = command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED)
         if not isinstance(mode, CopterGuided | CopterAuto) or not is_vertical:

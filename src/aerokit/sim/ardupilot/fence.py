@@ -223,9 +223,7 @@ class ArduPilotFence(Generic[HostT]):
         self.breach_time_ms = vehicle.time_boot_ms
         if vehicle.now - self._reported_at > _STATUS_INTERVAL_S:
             self._reported_at = vehicle.now
-            status = self.status()
-            if status is not None:
-                vehicle.send(status)
+            vehicle.send_built(m.FenceStatus.ID)
 
     def _clear(self, kinds: int) -> None:
         self.breached &= ~kinds

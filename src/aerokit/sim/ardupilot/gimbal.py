@@ -194,13 +194,9 @@ class ArduPilotGimbal:
         elif system != _KEEP_CONTROL:
             self.in_control = (system, component)
         if self.in_control != previous:
-            self._vehicle.call_later(0.0, self._send_status)  # later, after the acknowledgement
+            # The status follows the acknowledgement.
+            self._vehicle.call_later(0.0, lambda: self._vehicle.send_built(m.GimbalManagerStatus.ID))
         return True
-
-    def _send_status(self) -> None:
-        status = self.manager_status()
-        if status is not None:
-            self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
         """Apply GIMBAL_MANAGER_FLAGS with angles or rates. Values that are not given are NaN."""

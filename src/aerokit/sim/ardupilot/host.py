@@ -39,6 +39,8 @@ class ArduPilotMode:
     can_arm: bool = True
     arms_with_raised_throttle: bool = False
     can_change_speed: bool = False
+    speed: float
+    """Speed to fly or drive at, in m/s. Only modes with `can_change_speed` have it."""
     refused_because: str = "init failed"
     """Reason that a status text gives when `enter` returns False."""
     returns_on_path: bool = False

@@ -140,12 +140,12 @@ class SimulatedPlane(PlaneHost):
     def listen_for_setpoints(self) -> None:
         PlaneSetpoints(self)
 
-    def unknown_mode(self, number: int) -> tuple[int, str]:
+    def text_for_unknown_mode(self, number: int) -> tuple[int, str]:
         if number in _LIFTING_MODES:
             return MavSeverity.INFO, "Q_ENABLE 0"
-        return super().unknown_mode(number)
+        return super().text_for_unknown_mode(number)
 
-    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         return "Flight mode change failed"
 
     @property

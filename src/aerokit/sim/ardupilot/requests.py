@@ -121,15 +121,9 @@ class ArduPilotMessageRequests:
 
     def send_soon(self, message_id: int, channel: Channel) -> None:
         """Send a message directly after the acknowledgement of the command that is being handled."""
-
-        def send() -> None:
-            message = self._vehicle.build(message_id)
-            # The firmware sends RC_CHANNELS_RAW only on MAVLink 1 ports.
-            is_allowed = message_id != m.RcChannelsRaw.ID or channel.version == 1
-            if message is not None and is_allowed:
-                self._vehicle.send(message, channel)
-
-        self._vehicle.call_later(0.0, send)
+        # The firmware sends RC_CHANNELS_RAW only on MAVLink 1 ports.
+        if message_id != m.RcChannelsRaw.ID or channel.version == 1:
+            self._vehicle.call_later(0.0, partial(self._vehicle.send_built, message_id, channel))
 
     def _send_modes(self, index: int, channel: Channel) -> None:
         """Send AVAILABLE_MODES of the mode with this index, or of all modes for 0."""

@@ -347,7 +347,7 @@ class SimulatedRover(RoverHost):
     def is_at_rest(self) -> bool:
         return abs(self.motion.speed_m_s) < 0.01
 
-    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         return "Flight mode change failed"
 
     def make_commands(self) -> dict[int, CommandHandler]:

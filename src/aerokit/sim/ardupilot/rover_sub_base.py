@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavResult, SpeedType
@@ -186,7 +186,7 @@ class RoverSubVehicle(ArduPilotVehicle):
         is_valid = is_horizontal and command.param2 > 0
         if not self.mode.can_change_speed or not is_valid:
             return MavResult.FAILED
-        cast("Any", self.mode).speed = command.param2
+        self.mode.speed = command.param2
         return MavResult.ACCEPTED
 
 

@@ -295,7 +295,7 @@ class SimulatedSub(SubHost):
     def is_at_rest(self) -> bool:
         return self.motion.is_still
 
-    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         if reason == "requires position":
             return f"Mode change failed: {mode.name} requires position"
         return f"Flight mode change failed {mode.name}"

@@ -198,11 +198,11 @@ class ArduPilotVehicle(ArduPilotHost):
     def reset_controllers(self) -> None:
         """Reset the parts that only this kind of vehicle has. Called at power-on, after the modes were created."""
 
-    def unknown_mode(self, number: int) -> tuple[int, str]:
+    def text_for_unknown_mode(self, number: int) -> tuple[int, str]:
         """Return severity and text for a mode number that does not exist."""
         return MavSeverity.WARNING, f"No such mode {number}"
 
-    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         """Return the text that reports a refused mode change."""
         return f"Mode change to {mode.name} failed: {reason}"
 
@@ -295,7 +295,7 @@ class ArduPilotVehicle(ArduPilotHost):
             return True
         mode = self._modes.get(number)
         if mode is None:
-            self.send_text(*self.unknown_mode(number))
+            self.send_text(*self.text_for_unknown_mode(number))
             return False
         refusal_by_fence = self.fence.refusal(mode)
         if refusal_by_fence is not None:
@@ -304,11 +304,11 @@ class ArduPilotVehicle(ArduPilotHost):
         is_armed = self.motors.is_armed
         has_position = self.navigation.has_position and not self.failsafes.has_estimator_failed
         if is_armed and mode.needs_position and not has_position:
-            self.send_text(MavSeverity.WARNING, self.refusal(mode, "requires position"))
+            self.send_text(MavSeverity.WARNING, self.refusal_text(mode, "requires position"))
             return False
         is_entered = mode.enter(force=not is_armed)  # A disarmed vehicle may select a mode that cannot run yet.
         if not is_entered:
-            self.send_text(MavSeverity.WARNING, self.refusal(mode, mode.refused_because))
+            self.send_text(MavSeverity.WARNING, self.refusal_text(mode, mode.refused_because))
             return False
         self.mode.leave()  # Like the firmware, leave the old mode after entering the new one.
         self.mode = mode

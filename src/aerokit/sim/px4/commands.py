@@ -187,7 +187,7 @@ class _FlightCommands:
             is_done = self._px4.arming.disarm("external command", force=force)
         else:
             self._px4.send_text(MavSeverity.CRITICAL, f"Unsupported ARM_DISARM param: {command.param1:.3f}")
-            return None
+            return None  # PX4 does not acknowledge this command.
         return MavResult.ACCEPTED if is_done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
@@ -302,7 +302,7 @@ class _FlightCommands:
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
         progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
         px4.commands.answer(command, MavResult.IN_PROGRESS, progress)
-        return None
+        return None  # The progress is the only answer.
 
     def transition(self, command: ReceivedCommand) -> int | None:
         px4 = self._px4

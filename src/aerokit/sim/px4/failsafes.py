@@ -249,7 +249,7 @@ class Px4Failsafes:
         elif mode == OFFBOARD:
             mode_bit = 2
         is_allowed = bool(round(parameters["COM_RC_OVERRIDE"]) & mode_bit)
-        return is_allowed and moved * 100 >= parameters["COM_RC_STICK_OV"]
+        return is_allowed and moved * 100 >= parameters["COM_RC_STICK_OV"]  # The parameter is in percent.
 
     def _is_excepted(self, parameter: str) -> bool:
         """Return True if the parameter excludes the intended mode from the failsafe."""

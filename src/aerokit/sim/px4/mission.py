@@ -175,7 +175,7 @@ class Px4Mission:
         self.is_finished = self._needs_selection = False
         self.forget_reached()
         self._jumps.clear()
-        self._check()
+        self._validate()
         if self._px4.mode != MISSION:
             return
         if self.is_valid:
@@ -184,7 +184,7 @@ class Px4Mission:
             self._px4.send_text(MavSeverity.CRITICAL, "No valid mission available, loitering")
             self._px4.change_mode(HOLD)
 
-    def _check(self) -> None:
+    def _validate(self) -> None:
         items = self._px4.missions.commands
         problem = rejection(self._px4, items)
         warning = distance_warning(self._px4, items)

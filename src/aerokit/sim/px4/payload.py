@@ -103,7 +103,7 @@ class Px4Gimbal:
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
         """Set the angles, and the rates at which they change. If any angle is NaN, all angles stay."""
-        if flags & Flags.RETRACT:
+        if flags & Flags.RETRACT:  # The gimbal has no retracted position.
             return
         current = self.angles()
         if flags & Flags.NEUTRAL:
