@@ -191,7 +191,7 @@ class RoverGuided(GuidedTargetMode):
     def go_to(self, position: Ned) -> None:
         super().go_to(position)
         self._has_arrived = False
-        self.speed = self.vehicle.waypoint_speed
+        self.speed: float = self.vehicle.waypoint_speed
 
     def update(self, dt: float) -> None:
         rover, target = self.vehicle, self._target

@@ -12,13 +12,14 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import LogEntry, LogErase, LogRequestData, LogRequestEnd, LogRequestList
 from aerokit.mavlink.signing import ONE_MINUTE, SigningKey, timestamp_at
 from aerokit.protocols.servers.files import FileTree, TextMount
+from aerokit.protocols.servers.ftp import SessionFtpServer
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.autopilot import VehicleSigning, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.logs import LogServer, SimulatedLog
 from aerokit.sim.missions import MissionMount
-from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
+from aerokit.sim.parameter_server import ArduPilotParameterServer, ParameterServer, rounded
 from aerokit.sim.parameters import ParameterPackMount
 
 DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
@@ -110,11 +111,11 @@ class ArduPilotStorage(VehicleStorage):
         self.files.mounts["@PARAM"] = ParameterPackMount(vehicle.parameters, self._apply)
         self.files.mounts["@MISSION"] = MissionMount(vehicle.missions)
         banner = vehicle.send_banner
-        self.parameters = ArduPilotParameterServer(
+        self.parameters: ParameterServer = ArduPilotParameterServer(
             vehicle, vehicle.parameters, sends_errors=parameter_errors, send_banner=banner
         )
-        self.ftp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
-        self.logs = ArduPilotLogServer(vehicle, logs, self.files)
+        self.ftp: SessionFtpServer[FileTree] = ArduPilotFtp(vehicle, self.files, send_banner=banner)
+        self.logs: LogServer = ArduPilotLogServer(vehicle, logs, self.files)
         self.limit_rates(link_bytes_per_s, parameters=0.3, files=1 / 3, logs=0.5)
 
     def _apply(self, name: str, value: float) -> None:

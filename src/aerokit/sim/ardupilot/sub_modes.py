@@ -159,7 +159,7 @@ class SubGuided(GuidedTargetMode):
 
     def enter(self, *, force: bool) -> bool:
         self._place = self._target = self._heading = None
-        self.speed = self.vehicle.parameters["WPNAV_SPEED"] / 100.0
+        self.speed: float = self.vehicle.parameters["WPNAV_SPEED"] / 100.0
         return True
 
     def go_to(self, position: Ned) -> None:

@@ -29,7 +29,7 @@ from aerokit.sim.ardupilot.navigation import ArduPilotNavigation
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio, AuxiliaryOutputs
 from aerokit.sim.ardupilot.requests import ArduPilotMessageRequests
 from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, ArduPilotStorage
-from aerokit.sim.autopilot import SimulatedBattery
+from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler
 from aerokit.sim.logs import SimulatedLog
@@ -134,7 +134,7 @@ class ArduPilotVehicle(ArduPilotHost):
         """Mission, fence and rally points, which survive a reboot."""
         self._reset()
         self._listen()
-        self.storage = ArduPilotStorage(
+        self.storage: VehicleStorage = ArduPilotStorage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
 

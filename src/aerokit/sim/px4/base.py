@@ -13,7 +13,7 @@ from typing import ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.mavlink.signing import SigningKey
-from aerokit.sim.autopilot import SimulatedBattery
+from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
 from aerokit.sim.logs import SimulatedLog
@@ -106,7 +106,9 @@ class Px4Vehicle(Px4Host):
         """Camera trigger, enabled while the parameter TRIG_MODE is not 0."""
         self._reset()
         self._listen()
-        self.storage = Px4Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
+        self.storage: VehicleStorage = Px4Storage(
+            self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s
+        )
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return handlers by MAV_CMD."""

@@ -15,11 +15,12 @@ from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat, LogEntry
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
 from aerokit.protocols.ftp import DATA_SIZE
-from aerokit.protocols.servers.files import EINVAL, FileFault, FileHandle
+from aerokit.protocols.servers.files import EINVAL, FileFault, FileHandle, FileTree
+from aerokit.protocols.servers.ftp import SessionFtpServer
 from aerokit.sim.autopilot import VehicleSigning, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.logs import BLOCK_SIZE, LogServer, SimulatedLog
-from aerokit.sim.parameter_server import Px4ParameterServer
+from aerokit.sim.parameter_server import ParameterServer, Px4ParameterServer
 from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
@@ -182,11 +183,11 @@ class Px4Storage(VehicleStorage):
         if parameter_file:
             self.files.mounts["@PARAM"] = Px4ParameterMount(px4.parameters, self._apply)
         sends_param_error = not px4.version.startswith("1.16")
-        self.parameters = Px4ParameterServer(px4, px4.parameters, sends_errors=sends_param_error)
-        self.ftp = Px4Ftp(px4, self.files)
+        self.parameters: ParameterServer = Px4ParameterServer(px4, px4.parameters, sends_errors=sends_param_error)
+        self.ftp: SessionFtpServer[FileTree] = Px4Ftp(px4, self.files)
         # Creating and removing a file leaves the folder of the logs, which exists even if there are none.
         self.files.put(f"{Px4LogServer.FOLDER}/.keep", b"").clear_folder(Px4LogServer.FOLDER)
-        self.logs = Px4LogServer(px4, logs, self.files)
+        self.logs: LogServer = Px4LogServer(px4, logs, self.files)
         self.limit_rates(link_bytes_per_s, parameters=_LINK_SHARE, files=_LINK_SHARE, logs=_LINK_SHARE)
 
     def _apply(self, name: str, value: float) -> None:
