@@ -368,7 +368,7 @@ def _stays_armed(stage: Stage) -> None:
     """Let the pilot arm during the motor test."""
     accepted(C.DO_MOTOR_TEST)(stage)
     copter: Any = stage.simulated
-    asyncio.get_running_loop().call_later(0.3, lambda: copter.motors.set_armed(True, copter.now))
+    asyncio.get_running_loop().call_later(0.3, lambda: copter.motors.set_armed(armed=True))
 
 
 async def _in_shell(stage: Stage, use: Callable[[Any], Any]) -> None:

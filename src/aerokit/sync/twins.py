@@ -4747,7 +4747,8 @@ class Vehicle(VehicleTwin):
                 vehicle keeps its present altitude.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
-            tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
+            tolerance_m: arrival radius in metres; None: the default of the type of vehicle. A plane then also counts as
+                arrived once it has flown half a circle around the target.
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.

@@ -112,7 +112,7 @@ def test_json_has_steps_and_result(entered: list[bool], capsys: pytest.CaptureFi
 
 def test_armed_vehicle_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
-    copter.call_later(0.5, lambda: copter.motors.set_armed(True, copter.now))
+    copter.call_later(0.5, lambda: copter.motors.set_armed(armed=True))
     assert run(copter, "gyroscope") == 5
     assert "the vehicle is armed; nothing was sent" in capsys.readouterr().err
 

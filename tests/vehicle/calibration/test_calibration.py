@@ -384,7 +384,7 @@ async def test_armed_during_calibration_ends_it() -> None:
     async with stage(SimulatedCopter) as (copter, vehicle, _):
         with pytest.raises(OperationRejected, match="the vehicle was armed"):
             async for _ in vehicle.calibrate.compass():
-                copter.motors.set_armed(True, copter.now)
+                copter.motors.set_armed(armed=True)
 
 
 async def test_reboot_during_calibration_ends_it() -> None:

@@ -1,6 +1,11 @@
-"""Places out of reach are rejected before anything is sent, unless the caller allows them."""
+"""Places out of reach are rejected before anything is sent, and a plane arrives although it never reaches the place."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import anyio
 import pytest
@@ -9,7 +14,10 @@ from flight_harness import Flight
 from aerokit import Position
 from aerokit.errors import InvalidArgument
 from aerokit.missions import Mission, RallyPoints, rally_point, waypoint
-from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, CircleDetector
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.session.session import VehicleSession
 
 pytestmark = pytest.mark.anyio
 
@@ -79,3 +87,40 @@ async def test_plan_with_far_item_is_not_uploaded(grounded: Flight, kind: str) -
         points = RallyPoints([rally_point(far.latitude_deg, far.longitude_deg, altitude_relative_m=20.0)])
         with pytest.raises(InvalidArgument, match="more than max_distance_m"):
             await grounded.vehicle.rally.upload(points)
+
+
+CENTER = Position(47.0, 8.0, altitude_relative_m=60.0)
+
+
+def detects(places: Iterable[tuple[float, float, float]]) -> bool:
+    """Return True if a vehicle at these places (metres north, east and up of the center) circles the center."""
+    position = SimpleNamespace(latest=None)
+    detector = CircleDetector(cast("VehicleSession", SimpleNamespace(telemetry=SimpleNamespace(position=position))))
+    detected = False
+    for north_m, east_m, up_m in places:
+        position.latest = CENTER.offset(north_m=north_m, east_m=east_m).replace(altitude_relative_m=60.0 + up_m)
+        detected = detector.circles(CENTER)
+    return detected
+
+
+def arc(degrees: int, radius_m: float = 150.0, *, up_m: float = 0.0) -> list[tuple[float, float, float]]:
+    angles = map(math.radians, range(0, degrees + 1, 10))
+    return [(radius_m * math.cos(angle), radius_m * math.sin(angle), up_m) for angle in angles]
+
+
+@pytest.mark.parametrize(
+    ("places", "expected"),
+    [
+        ([], False),
+        (arc(170), False),
+        (arc(190), True),
+        (arc(190, 15.0), False),  # a hovering copter that drifts around its target
+        (arc(190, up_m=30.0), False),  # still climbing
+        (arc(190) + arc(10, 300.0), False),  # gone since
+        ([(50.0, east_m, 0.0) for east_m in range(-2000, 2001, 20)], False),
+        ([(0.0, 0.0, 0.0)] * 100, False),
+    ],
+)
+def test_circle_around_target_is_detected(places: list[tuple[float, float, float]], expected: bool) -> None:
+    assert detects(places) == expected
+    assert detects((north_m, -east_m, up_m) for north_m, east_m, up_m in places) == expected  # the other direction

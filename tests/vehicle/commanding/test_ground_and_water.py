@@ -175,7 +175,7 @@ async def test_go_to_slow_fall_error_names_descent() -> None:
 async def test_go_to_vehicle_disarmed_in_air_error_names_height() -> None:
     copter = SimulatedCopter(boot_time_s=1.0)
     with pytest.raises(OperationRejected, match=r"the vehicle disarmed 1\d\.\d m above home"):
-        await fall(copter, lambda: copter.motors.set_armed(False, copter.now))
+        await fall(copter, lambda: copter.motors.set_armed(armed=False))
 
 
 async def test_rover_return_to_launch_ends_at_home() -> None:

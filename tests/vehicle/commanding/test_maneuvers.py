@@ -318,6 +318,23 @@ async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., Simul
         await vehicle.go_to(center.offset(north_m=300), timeout=120)  # ArduPlane keeps the radius.
 
 
+@pytest.mark.parametrize(("kind", "radius"), [(SimulatedPlane, "WP_LOITER_RAD"), (SimulatedPx4Plane, "NAV_LOITER_RAD")])
+async def test_plane_on_wide_circle_has_arrived(kind: Callable[..., Any], radius: str) -> None:
+    plane = kind(boot_time_s=0.0)
+    plane.parameters[radius] = 200.0
+    async with simulated_link(plane) as link, aerokit.connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.arm()
+        await vehicle.take_off(50.0, timeout=120)
+        target = vehicle.position.value.offset(north_m=600).replace(altitude_amsl_m=None, altitude_relative_m=60.0)
+        for call in (vehicle.go_to(target, timeout=200), vehicle.loiter(target, duration_s=1, timeout=200)):
+            await call
+            assert vehicle.position.value.distance_to(target) == pytest.approx(200, rel=0.25)
+        if kind is SimulatedPlane:
+            await vehicle.return_to_launch(timeout=200)
+            assert vehicle.position.value.distance_to(vehicle.home.value.position) < 250
+
+
 async def test_figure_eight_axis_is_within_pi() -> None:
     plane = SimulatedPx4Plane(boot_time_s=0.0)
     axes_rad: list[float] = []

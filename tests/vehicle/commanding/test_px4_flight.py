@@ -191,7 +191,7 @@ async def keep_moving_home(flight: Px4Flight) -> None:
 
 async def test_stalled_go_to_fails_although_home_moves(flying: Px4Flight) -> None:
     target = north_of_home(flying, 30.0)
-    flying.px4.flight.go = lambda: None  # type: ignore[method-assign]  # The vehicle stays where it is.
+    flying.px4.flight.fly_to_target = lambda: None  # type: ignore[method-assign]  # The vehicle stays where it is.
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(keep_moving_home, flying)
         with pytest.raises(OperationTimeout, match=r"has not moved for 1[23] s; the vehicle is 3\d"):

@@ -142,7 +142,7 @@ class Px4PlaneFlight(Px4Flight):
         self._motion.bank_and_climb(speed, math.radians(parameters["FW_R_LIM"]) * sticks.roll, climb)
         self.stay_here()  # If stick input is lost, the plane circles here.
 
-    def go(self) -> None:
+    def fly_to_target(self) -> None:
         self.circle()
 
     def circle(self) -> None:

@@ -17,6 +17,7 @@ from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import (
     MAX_SILENCE_S,
     POSITION_MAX_AGE_S,
+    CircleDetector,
     StallDetector,
     await_progress,
 )
@@ -308,6 +309,7 @@ class FlightActions(VehicleBase):
     async def _await_home(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         home = self.telemetry.home
         arrival_radius_m = self.autopilot.arrival_radius_m
+        circle = CircleDetector(self._session)
         started = self.connection.now()
 
         def distance_m() -> float:
@@ -315,8 +317,15 @@ class FlightActions(VehicleBase):
                 return math.inf
             return self._position.distance_to(Position(home.latest.latitude_deg, home.latest.longitude_deg))
 
+        def circles_home() -> bool:
+            return home.latest is not None and circle.circles(
+                Position(home.latest.latitude_deg, home.latest.longitude_deg)
+            )
+
         def is_back() -> bool:
-            return self._position.was_received_since(started) and distance_m() <= arrival_radius_m and not order.end
+            if not self._position.was_received_since(started) or order.end:
+                return False
+            return circles_home() or distance_m() <= arrival_radius_m
 
         def describe() -> str:
             is_known = math.isfinite(distance_m())

@@ -195,6 +195,49 @@ class StallDetector:
         return f", after it descended {self._max_altitude_m - altitude_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
 
 
+# A vehicle circles a place if it has flown half a circle around it, and its distances differ by this factor at most. On
+# a straight flight past a place, they do so only for 80°.
+CIRCLE_DISTANCE_RATIO, HALF_CIRCLE_DEG = 1.3, 180.0
+# A hovering vehicle that drifts around its target does not circle it.
+MIN_CIRCLE_RADIUS_M = 20.0
+# A plane that circles a place counts as arrived within this height above or below it.
+CIRCLE_HEIGHT_M = 20.0
+
+
+class CircleDetector:
+    """Detects that a plane circles a place.
+
+    The radius is not compared with a parameter: planes enlarge their circles with speed and altitude, and so that their
+    bank angle stays within its limit.
+    """
+
+    def __init__(self, session: VehicleSession) -> None:
+        self._position = session.telemetry.position
+        self._min_m = self._max_m = 0.0  # smallest and largest distance since the turn began; 0: no turn has begun
+        self._bearing_deg = 0.0
+        self._turned_deg = 0.0  # angle by which the bearing from the place has changed, positive clockwise
+        self._circle_radius_m = -math.inf  # −inf until the first half circle is complete
+
+    def circles(self, place: Position) -> bool:
+        """Record the vehicle's position. Return True if the vehicle circles ``place`` at about its altitude."""
+        here = self._position.latest
+        if here is None:
+            return False
+        coordinates = place.latitude_deg, place.longitude_deg, here.latitude_deg, here.longitude_deg
+        distance_m, bearing_deg = geo.distance_m(*coordinates), geo.bearing_deg(*coordinates)
+        self._min_m, self._max_m = min(self._min_m, distance_m), max(self._max_m, distance_m)
+        if self._min_m < MIN_CIRCLE_RADIUS_M or self._max_m > CIRCLE_DISTANCE_RATIO * self._min_m:
+            self._min_m = self._max_m = distance_m
+            self._turned_deg = 0.0
+        else:
+            self._turned_deg += math.remainder(bearing_deg - self._bearing_deg, 360.0)
+        self._bearing_deg = bearing_deg
+        if abs(self._turned_deg) >= HALF_CIRCLE_DEG:
+            self._circle_radius_m = self._max_m
+        is_on_circle = distance_m <= CIRCLE_DISTANCE_RATIO * self._circle_radius_m
+        return is_on_circle and abs(VehiclePosition.height_above(here, place)) <= CIRCLE_HEIGHT_M
+
+
 def _approximate_distance_m(here: Position, place: Position) -> float:
     """Return the horizontal distance, exact to one per cent, plus the vertical distance."""
     # An exact distance takes ten times as long to compute.

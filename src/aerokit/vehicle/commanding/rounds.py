@@ -12,7 +12,7 @@ from aerokit.errors import HeartbeatTimeout, OperationRejected, OperationTimeout
 from aerokit.mavlink.messages import OrbitExecutionStatus
 from aerokit.vehicle.commanding.closed_paths import PathSetpoints
 from aerokit.vehicle.commanding.guided import Guided
-from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, StallDetector, await_progress
+from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S, CircleDetector, StallDetector, await_progress
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,6 +68,7 @@ class RoundFlight:
         self._telemetry = context.session.telemetry
         self._operation = operation
         self._counter = counter
+        self._circle = CircleDetector(context.session)
         self._rounds = math.inf if rounds is None else rounds
         self._limits = limits
         # Why the vehicle does not fly the ordered circle, so that `fly_by_command` must order a hold; empty if it does.
@@ -186,6 +187,8 @@ class RoundFlight:
         position = self._context.vehicle_position
         if self._counter is not None:
             return self._counter.is_on_path
+        if self._circle.circles(self._center):
+            return True
         return position.remaining_distance(self._center) <= position.arrival_radius_m
 
     def _count_rounds(self) -> float:

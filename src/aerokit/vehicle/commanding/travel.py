@@ -35,6 +35,7 @@ from aerokit.vehicle.commanding.progress import (
     MAX_DISTANCE_M,
     MAX_SILENCE_S,
     POSITION_MAX_AGE_S,
+    CircleDetector,
     StallDetector,
     await_progress,
 )
@@ -102,7 +103,8 @@ class TravelActions(VehicleBase):
                 vehicle keeps its present altitude.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
-            tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
+            tolerance_m: arrival radius in metres; None: the default of the type of vehicle. A plane then also counts as
+                arrived once it has flown half a circle around the target.
             max_distance_m: a place farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
@@ -147,6 +149,7 @@ class TravelActions(VehicleBase):
                 await self._await_arrival(
                     target,
                     arrival_radius_m,
+                    circle=CircleDetector(self._session) if tolerance_m is None else None,
                     order=order,
                     mode=mode,
                     unacknowledged_target=unacknowledged_target,
@@ -208,6 +211,7 @@ class TravelActions(VehicleBase):
         target: Position,
         arrival_radius_m: float,
         *,
+        circle: CircleDetector | None,
         order: Order,
         mode: Mode,
         unacknowledged_target: SetPositionTargetGlobalInt | None,
@@ -229,8 +233,11 @@ class TravelActions(VehicleBase):
 
         def resend_and_check_arrival() -> bool:
             resend_if_due()
-            is_known = self._position.was_received_since(started)
-            return is_known and self._position.remaining_distance(target) <= arrival_radius_m and not order.end
+            if not self._position.was_received_since(started) or order.end:
+                return False
+            if circle is not None and circle.circles(target):
+                return True
+            return self._position.remaining_distance(target) <= arrival_radius_m
 
         with self._session.streaming("position"):
             await await_progress(
