@@ -158,6 +158,16 @@ def test_partial_upload_is_not_restarted() -> None:
     assert rejected(exchange).result == Result.OPERATION_CANCELLED
 
 
+@pytest.mark.parametrize(("silence_s", "is_ignored"), [(4.4, True), (4.6, False)])
+def test_partial_upload_goes_on_after_denial_of_copied_request(silence_s: float, is_ignored: bool) -> None:
+    exchange = upload(2, first=3)
+    sent_since(exchange)
+    assert request_item(exchange, 3, 0.1) == [3]
+    assert acknowledge(exchange, Result.DENIED, 0.1 + silence_s) == []
+    assert exchange.done != is_ignored
+    assert exchange.may_have_changed_items  # item 3 may have arrived
+
+
 def test_expired_upload_without_restarts_reports_error() -> None:
     exchange = upload(idle_timeout_s=100.0)
     for number in range(4):
@@ -254,13 +264,14 @@ def test_refusal_of_single_item_in_flight_is_unambiguous() -> None:
         assert exchange.is_refusal_ambiguous is vague
 
 
-def test_partial_upload_may_change_items_after_second() -> None:
+def test_partial_upload_changes_nothing_if_first_item_is_refused() -> None:
     exchange = upload(3, first=5)
-    for seq, state in ((None, (False, False)), (5, (True, False)), (6, (True, True))):
-        if seq is not None:
-            request_item(exchange, seq, 1.0 + seq / 10)
-        assert (exchange.was_started, exchange.may_have_changed_items) == state
+    assert not exchange.may_have_changed_items
+    request_item(exchange, 5, 1.0)
+    assert exchange.may_have_changed_items
     assert not exchange.was_sent_completely
+    acknowledge(exchange, Result.INVALID, 1.1)
+    assert not exchange.may_have_changed_items
 
 
 @pytest.mark.parametrize("seq", [4, 8])

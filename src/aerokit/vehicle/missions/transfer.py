@@ -193,7 +193,8 @@ class PlanChannel:
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
             return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
         if is_partly_overwritten:
-            return "; the vehicle now has some new and some old items: upload again, or clear"
+            has = "may have" if is_silent else "has"
+            return f"; the vehicle now {has} some new and some old items: upload again, or clear"
         if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT removes further items.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
         return "; the vehicle still has its previous items"
