@@ -256,7 +256,8 @@ class VehicleWatch:
         lost, speed = self._lost_reading, self._lost_speed
         if lost is None:
             return False
-        away_s = reading.read_at - lost.read_at
+        # While the computer sleeps, our clock stands still.
+        away_s = reading.read_at - lost.read_at + self._connection._slept_since(lost.read_at)
         difference_ms = abs(reading.milliseconds - lost.milliseconds - speed * away_s)
         if difference_ms <= speed * (RESUME_TOLERANCE_S + RESUME_TOLERANCE_RATIO * away_s):
             self._lost_reading = None
