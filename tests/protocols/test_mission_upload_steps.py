@@ -184,6 +184,15 @@ def test_upload_error_after_silence_restarts(silence_s: float, answer: list[int 
     assert acknowledge(exchange, Result.ERROR, 1.0 + silence_s) == answer
 
 
+def test_upload_error_after_lost_items_restarts() -> None:
+    """The vehicle repeats its request until its transfer expires, because it receives nothing."""
+    exchange = upload()
+    sent_since(exchange)
+    for number in range(19):
+        request_item(exchange, 0, 1.0 + 0.25 * number)
+    assert acknowledge(exchange, Result.ERROR, 5.6) == ["MISSION_COUNT"]
+
+
 # --------------------------------------------------------------------------------- items
 
 

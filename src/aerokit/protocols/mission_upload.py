@@ -62,8 +62,6 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
 
-    # start() sets this attribute.
-    _received_at: float
     # The first request sets this attribute.
     _sends_floats: bool
 
@@ -121,17 +119,15 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def start(self, now: float) -> None:
         self._start_clock(now)
-        self._received_at = now
         self._announce_items(now)
 
     def receive(self, message: Message, now: float) -> None:
         if not self._is_ours(message):
             return
-        silence_s = now - self._received_at
-        self._received_at = now
         if isinstance(message, MissionAck):
-            # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
-            has_expired = self._vehicle_has_requested and silence_s >= TRANSFER_EXPIRY_S
+            # Without progress for long, ERROR means that the vehicle's transfer has expired: our items were lost, even
+            # if its requests arrived. The upload then starts again.
+            has_expired = self._vehicle_has_requested and now - self._progress_at >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(message.type, now)
             else:
