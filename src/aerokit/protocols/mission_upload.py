@@ -266,6 +266,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         # A partial upload does not begin again, because another station may have changed the vehicle's plan since.
         if self.is_partial or self._restarts >= MAX_RESTARTS:
             self._fail_as_refused(result)
+            self._is_item_refused = False
             return
         self._restarts += 1
         self._reset()
