@@ -48,7 +48,10 @@ class CheckedPlans:
                 assert self._numbers(plan.to_items()) == self._on_vehicle(name)
                 self._uploaded[name] = plan
         except OperationTimeout as error:  # The link is bad. Any other error would be a false report.
-            assert "still has its previous items" not in str(error) or self._on_vehicle(name) == before
+            self._check_error(error, name, before)
+
+    def _check_error(self, error: OperationTimeout, name: str, before: list[tuple[float, ...]]) -> None:
+        assert "still has its previous items" not in str(error) or self._on_vehicle(name) == before
 
     def _changed_plan(self, name: str) -> Any:
         plan = self._uploaded.get(name)
