@@ -156,6 +156,7 @@ def test_partial_upload_is_not_restarted() -> None:
     assert request_item(exchange, 3, 0.1) == [3]
     assert acknowledge(exchange, Result.OPERATION_CANCELLED, 0.2) == []
     assert rejected(exchange).result == Result.OPERATION_CANCELLED
+    assert exchange.was_dropped
     assert exchange.may_have_changed_items
 
 

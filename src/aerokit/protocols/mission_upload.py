@@ -87,6 +87,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         """True if it is unknown which of several items in flight was refused. To find out, send items one at a time."""
         self.was_started: bool = False
         """True once the vehicle has requested an item. From then on it may have overwritten items."""
+        self.was_dropped: bool = False
+        """True if the upload failed because the vehicle has dropped the transfer, e.g. in a reboot."""
         self._is_item_refused = False
         self._restarts = 0
         self._busy_until: float | None = None
@@ -267,6 +269,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         if self.is_partial or self._restarts >= MAX_RESTARTS:
             self._fail_as_refused(result)
             self._is_item_refused = False
+            self.was_dropped = True
             return
         self._restarts += 1
         self._reset()
