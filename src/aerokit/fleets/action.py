@@ -29,7 +29,7 @@ from aerokit.fleets.policy import FleetResult, MemberFailure
 from aerokit.vehicle.commanding.arbiter import STEERING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.connection.connection import Connection
     from aerokit.fleets.events import FleetEvent
