@@ -105,7 +105,11 @@ class VehicleRecovered(Event):
 
 
 class VehicleRebooted(Event):
-    """The autopilot rebooted: its time since boot went backwards. aerokit requests message rates again."""
+    """The autopilot rebooted: its time since boot went backwards. aerokit requests message rates again.
+
+    Also published if the time since boot does not continue after a lost link was reopened: the vehicle has rebooted, or
+    the link leads to another vehicle.
+    """
 
 
 class DuplicateSender(Event):

@@ -267,6 +267,30 @@ async def test_vehicle_switched_off_with_its_cable() -> None:
         await vehicle.wait_ready()
 
 
+async def test_other_vehicle_on_restored_link_is_not_taken_for_first() -> None:
+    older, name = SimulatedCopter(boot_time_s=0), "FENCE_ALT_MAX"
+    older.parameters[name] = 77.0
+    async with simulated_link(older) as other_link:
+        await anyio.sleep(60)
+        async with cabled() as (cable, vehicle):
+            await vehicle.wait_ready()
+            await vehicle.parameters.download()
+            await anyio.sleep(8)
+            with (
+                vehicle.subscribe(events.LinkRestored) as restored,
+                vehicle.subscribe(events.VehicleRebooted) as reboots,
+            ):
+                cable.pull()
+                cable.link.close()
+                cable.link = other_link
+                await other_link.open(cable)
+                cable.plug_in()
+                await restored.get(10)
+                writes = await vehicle.parameters.upload({name: 100.0})
+                await reboots.get(5)
+            assert (writes[name].outcome, older.parameters[name]) == ("set", 100.0)
+
+
 async def test_connect_finds_vehicle_on_restored_link() -> None:
     copter = SimulatedCopter(boot_time_s=0)
     copter.faults.silent = True

@@ -265,6 +265,28 @@ async def test_older_upload_that_replaces_nothing_voids_nothing() -> None:
         assert list(await stage.fleet.start_missions()) == ["north/2"]
 
 
+@pytest.mark.parametrize("cause", ["upload", "reboot", "download"])
+async def test_start_missions_after_plan_was_replaced_starts_none(cause: str) -> None:
+    async with open_stage(2) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        await stage.fleet.upload({name: mission_of(10.0 * number) for number, name in enumerate(stage.copters)})
+        vehicle = stage.fleet.vehicles["north/2"]
+        if cause == "upload":
+            await vehicle.mission.upload(mission_of(0))
+        elif cause == "reboot":
+            await vehicle.reboot()
+            await vehicle.wait_ready()
+        else:  # The plan is still the same.
+            await vehicle.mission.download(method="items")
+        (await stage.fleet.arm()).raise_for_errors()
+        if cause == "download":
+            (await stage.fleet.start_missions()).raise_for_errors()
+            return
+        with pytest.raises(OperationRejected, match="mission of north/2 may have been replaced"):
+            await stage.fleet.start_missions()
+        assert all(copter.motion.is_on_ground for copter in stage.copters.values())
+
+
 async def test_upload_conflicting_missions_is_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()

@@ -309,7 +309,8 @@ class RandomFlight:
     def judge_events(self) -> None:
         for event in self.events:
             if isinstance(event, MemberTakenOver):
-                if event.member not in self.pilots:
+                # PX4 enters a failsafe if its set-points end, and the hold after them was refused.
+                if event.member not in self.pilots and "in a failsafe" not in event.reason:
                     self.faults.append(f"nobody has taken over: {event}")
             elif isinstance(event, PolicyApplied) and any(
                 name in self.released and event.at > self.released[name][0] for name in event.orders
@@ -390,7 +391,7 @@ class RandomFlight:
 
 
 @pytest.mark.sampled(15)
-@pytest.mark.parametrize("seed", range(150))
+@pytest.mark.parametrize("seed", [*range(150), 344])
 async def test_random_actions_of_fleet_and_members_break_no_rule(seed: int) -> None:
     flight = RandomFlight(seed)
     await flight.fly()

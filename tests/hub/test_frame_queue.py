@@ -51,11 +51,12 @@ def test_full_queue_drops_telemetry_first_then_new_frames() -> None:
     assert taken(frames) == [b"x"] * MAX_QUEUED_FRAMES
 
 
-def test_late_orders_are_dropped_and_returned() -> None:
+@pytest.mark.parametrize("kind", [MessageKind.ORDER, MessageKind.MEASUREMENT])
+def test_late_frames_are_dropped_and_returned(kind: MessageKind) -> None:
     frames = FrameQueue()
-    frames.put(held(b"first", MessageKind.ORDER, since=0.0), 0)
+    frames.put(held(b"first", kind, since=0.0), 0)
     frames.put(held(b"part", since=0.0), 0)
-    frames.put(held(b"second", MessageKind.ORDER, since=0.5), 0)
+    frames.put(held(b"second", kind, since=0.5), 0)
     assert ORDER_MAX_AGE_S == 1.0, "docs/hub.md and docs/reliability.md promise one second"
     assert frames.expire(1.0) == []
     assert [(why, expired.raw) for why, expired in frames.expire(1.01)] == [("late", b"first")]
@@ -83,12 +84,10 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
         assert len(frames) <= MAX_QUEUED_FRAMES
         assert sum(len(frame.raw) for frame in frames._frames.values()) == frames._bytes <= MAX_QUEUED_BYTES
         assert all(
-            now - frame.waiting_since <= ORDER_MAX_AGE_S
-            for frame in frames._frames.values()
-            if frame.kind is MessageKind.ORDER
+            now - frame.waiting_since <= ORDER_MAX_AGE_S for frame in frames._frames.values() if frame.kind.expires
         )
     assert len(taken(frames)) + dropped == len(arrivals)
-    assert frames._bytes == frames._order_count == frames._telemetry_count == 0
+    assert frames._bytes == frames._expiring_count == frames._telemetry_count == 0
 
 
 @pytest.mark.parametrize(
@@ -116,6 +115,8 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
         ("MISSION_CLEAR_ALL", True, MessageKind.ORDER),
         ("PARAM_SET", True, MessageKind.ORDER),
         ("GIMBAL_MANAGER_SET_PITCHYAW", True, MessageKind.ORDER),
+        ("GPS_INPUT", False, MessageKind.MEASUREMENT),
+        ("ODOMETRY", True, MessageKind.MEASUREMENT),
         ("NO_SUCH_MESSAGE", False, MessageKind.TRANSFER),
     ],
 )

@@ -33,6 +33,7 @@ from aerokit.mavlink.messages import (
     ParamValue,
     SetupSigning,
     Statustext,
+    VisionPositionEstimate,
 )
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.testing import run_virtual
@@ -111,6 +112,23 @@ async def test_commands_are_not_forwarded_after_blocked_loop() -> None:
         station.send(ORDER)
         await settle()
         assert copter.received == ["HEARTBEAT", "COMMAND_LONG"]
+
+
+@virtual
+async def test_measurements_are_not_forwarded_after_blocked_loop() -> None:
+    copter, companion, events = Program(1, 1), Program(1, 191), list[HubEvent]()
+    async with joined(copter, companion) as hub:
+        companion.send(STATION)
+        await anyio.sleep(1.0)
+        hub.on_event(events.append)
+        for blocked_s, expected in ((0.8, 1), (10.0, 0)):
+            copter.frames.clear()
+            companion.send(VisionPositionEstimate(0, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0))
+            block_loop(blocked_s)
+            await anyio.sleep(1.0)
+            assert len(copter.frames) == expected
+        assert of(hub, "b").dropped == {"late": 1}
+        assert not events
 
 
 @pytest.mark.parametrize("dialect", [STANDARD, Dialect("own", [Heartbeat, CommandLong, LandingTarget])])

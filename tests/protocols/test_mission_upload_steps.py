@@ -156,6 +156,18 @@ def test_partial_upload_is_not_restarted() -> None:
     assert request_item(exchange, 3, 0.1) == [3]
     assert acknowledge(exchange, Result.OPERATION_CANCELLED, 0.2) == []
     assert rejected(exchange).result == Result.OPERATION_CANCELLED
+    assert exchange.was_dropped
+    assert exchange.may_have_changed_items
+
+
+@pytest.mark.parametrize(("silence_s", "is_ignored"), [(4.4, True), (4.6, False)])
+def test_partial_upload_goes_on_after_denial_of_copied_request(silence_s: float, is_ignored: bool) -> None:
+    exchange = upload(2, first=3)
+    sent_since(exchange)
+    assert request_item(exchange, 3, 0.1) == [3]
+    assert acknowledge(exchange, Result.DENIED, 0.1 + silence_s) == []
+    assert exchange.done != is_ignored
+    assert exchange.may_have_changed_items  # item 3 may have arrived
 
 
 def test_expired_upload_without_restarts_reports_error() -> None:
@@ -172,6 +184,15 @@ def test_upload_error_after_silence_restarts(silence_s: float, answer: list[int 
     sent_since(exchange)
     request_item(exchange, 0, 1.0)
     assert acknowledge(exchange, Result.ERROR, 1.0 + silence_s) == answer
+
+
+def test_upload_error_after_lost_items_restarts() -> None:
+    """The vehicle repeats its request until its transfer expires, because it receives nothing."""
+    exchange = upload()
+    sent_since(exchange)
+    for number in range(19):
+        request_item(exchange, 0, 1.0 + 0.25 * number)
+    assert acknowledge(exchange, Result.ERROR, 5.6) == ["MISSION_COUNT"]
 
 
 # --------------------------------------------------------------------------------- items
@@ -254,13 +275,14 @@ def test_refusal_of_single_item_in_flight_is_unambiguous() -> None:
         assert exchange.is_refusal_ambiguous is vague
 
 
-def test_partial_upload_may_change_items_after_second() -> None:
+def test_partial_upload_changes_nothing_if_first_item_is_refused() -> None:
     exchange = upload(3, first=5)
-    for seq, state in ((None, (False, False)), (5, (True, False)), (6, (True, True))):
-        if seq is not None:
-            request_item(exchange, seq, 1.0 + seq / 10)
-        assert (exchange.was_started, exchange.may_have_changed_items) == state
+    states = [exchange.may_have_changed_items]
+    request_item(exchange, 5, 1.0)
+    states.append(exchange.may_have_changed_items)
     assert not exchange.was_sent_completely
+    acknowledge(exchange, Result.INVALID, 1.1)
+    assert [*states, exchange.may_have_changed_items] == [False, True, False]
 
 
 @pytest.mark.parametrize("seq", [4, 8])

@@ -29,13 +29,14 @@ from aerokit.fleets.policy import FleetResult, MemberFailure
 from aerokit.vehicle.commanding.arbiter import STEERING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.connection.connection import Connection
     from aerokit.fleets.events import FleetEvent
     from aerokit.fleets.members import Member
     from aerokit.fleets.policy import PolicyOrder, PolicyRules
     from aerokit.fleets.separation import Deconfliction
+    from aerokit.missions.item import MissionItem
     from aerokit.missions.mission import Mission
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.vehicle import Vehicle
@@ -496,6 +497,8 @@ class FleetContext:
         self.actions: dict[FleetAction, None] = {}  # those that have not ended, the newest last
         self.newest_moves: dict[str, FleetAction] = {}  # the newest action that moves each member
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
+        # The vehicles' items after this upload; None if they are unknown.
+        self.uploaded_items: dict[str, Sequence[MissionItem] | None] = {}
         # The missions of the upload that began last; empty if an older upload may have replaced one of them.
         self.newest_upload: Mapping[str, Mission] = {}
         self.is_closed: bool = False

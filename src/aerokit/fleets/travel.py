@@ -26,7 +26,7 @@ from aerokit.fleets.separation import (
     separate_by_altitude,
     separate_by_time,
 )
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavMissionType
 from aerokit.missions.mission import Mission
 from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
@@ -362,6 +362,10 @@ class Missions(SelectionBase):
         # If a newer upload has begun, only its missions count: they were not compared with the missions of this one.
         if self._context.newest_upload is missions:
             self._context.missions.update(missions)
+            self._context.uploaded_items = {
+                name: member.vehicle.mission._context.caches[MavMissionType.MISSION].items
+                for name, member in members.items()
+            }
         return result
 
     async def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
@@ -372,14 +376,22 @@ class Missions(SelectionBase):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: no mission was uploaded, the last upload failed or was for other members only, or a
-                member is unavailable or not armed. Nothing was sent.
+            OperationRejected: no mission was uploaded, the last upload failed or was for other members only, a mission
+                was replaced or its vehicle has rebooted since, or a member is unavailable or not armed. Nothing was
+                sent.
         """
         names = self._names_with_mission("start_missions")
         members = self._require_available(dict.fromkeys(names))
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:
             raise OperationRejected(f"start_missions: members not armed: {', '.join(disarmed)}; nothing was sent")
+        plans = {name: members[name].vehicle.mission._context for name in names}
+        items = self._context.uploaded_items
+        if changed := [name for name in names if plans[name].may_differ(MavMissionType.MISSION, items[name])]:
+            raise OperationRejected(
+                f"start_missions: the mission of {', '.join(changed)} may have been replaced since the upload (another"
+                " upload, or a reboot); nothing was sent; call upload() again"
+            )
 
         async def start(member: Member) -> None:
             await member.vehicle.mission.start(timeout=timeout)

@@ -109,6 +109,15 @@ class MessageKind(Enum):
     """Sent in order and never replaced, e.g. part of a transfer, an answer or a STATUSTEXT."""
     ORDER = "order"
     """A command: sent in order, but dropped after a second, so that it never arrives late."""
+    MEASUREMENT = "measurement"
+    """A measurement for the estimator of a vehicle: treated as a command, but its loss is not reported."""
+
+    @property
+    def expires(self) -> bool:
+        return self in _EXPIRING
+
+
+_EXPIRING = (MessageKind.ORDER, MessageKind.MEASUREMENT)
 
 
 # Periodic messages of which only the newest matters: a sender has a single instance of each. Messages with an instance
@@ -145,10 +154,22 @@ _ORDERS = (
 )  # fmt: skip
 
 
+# An estimator that gets an old measurement misplaces the vehicle. Vehicles send some of these messages as telemetry.
+_MEASUREMENTS = frozenset(
+    (
+        "GPS_INPUT", "ODOMETRY", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "GLOBAL_VISION_POSITION_ESTIMATE",
+        "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "OPTICAL_FLOW", "OPTICAL_FLOW_RAD", "DISTANCE_SENSOR",
+        "OBSTACLE_DISTANCE", "OBSTACLE_DISTANCE_3D",
+    )
+)  # fmt: skip
+
+
 @cache
 def kind_of(name: str, *, has_target: bool) -> MessageKind:
     if name not in _NOT_ORDERS and any(fnmatchcase(name, pattern) for pattern in _ORDERS):
         return MessageKind.ORDER
+    if name in _MEASUREMENTS:
+        return MessageKind.MEASUREMENT
     if name in _TELEMETRY and not has_target:
         return MessageKind.TELEMETRY
     return MessageKind.TRANSFER
@@ -226,9 +247,16 @@ class TargetFields:
 
     def is_command(self, message_id: int) -> bool:
         """Return True for a command, with or without a target (LANDING_TARGET has none)."""
+        return self._kind_of(message_id) is MessageKind.ORDER
+
+    def expires(self, message_id: int) -> bool:
+        """Return True for a message that must not be forwarded late."""
+        return self._kind_of(message_id).expires
+
+    def _kind_of(self, message_id: int) -> MessageKind:
         if self.is_unknown(message_id):
-            return False
-        return kind_of(self._dialect[message_id].NAME, has_target=True) is MessageKind.ORDER
+            return MessageKind.TRANSFER
+        return kind_of(self._dialect[message_id].NAME, has_target=True)
 
     def target_of(self, frame: Frame) -> tuple[int, int]:
         """Return the system id and component id of a frame's target; 0 means all."""

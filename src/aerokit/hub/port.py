@@ -54,8 +54,8 @@ class FrameQueue:
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._last_key = 0  # the negative key that was used last
-        # Counts of queued commands and telemetry frames. If a count is 0, the queue need not be searched for this kind.
-        self._order_count = 0
+        # Counts of queued frames that expire, and of telemetry. If a count is 0, the queue need not be searched.
+        self._expiring_count = 0
         self._telemetry_count = 0
 
     def __len__(self) -> int:
@@ -85,13 +85,13 @@ class FrameQueue:
         return dropped
 
     def expire(self, now: float) -> list[DroppedFrame]:
-        """Remove and return the commands that have waited too long."""
-        if not self._order_count:
+        """Remove and return the commands and measurements that have waited too long."""
+        if not self._expiring_count:
             return []
         late = [
             key
             for key, queued in self._frames.items()
-            if queued.kind is MessageKind.ORDER and now - queued.waiting_since > ORDER_MAX_AGE_S
+            if queued.kind.expires and now - queued.waiting_since > ORDER_MAX_AGE_S
         ]
         return [DroppedFrame("late", self._remove(key)) for key in late]
 
@@ -105,7 +105,7 @@ class FrameQueue:
     def clear(self) -> list[DroppedFrame]:
         dropped = [DroppedFrame("link_lost", frame) for frame in self._frames.values()]
         self._frames.clear()
-        self._bytes = self._order_count = self._telemetry_count = 0
+        self._bytes = self._expiring_count = self._telemetry_count = 0
         return dropped
 
     def _is_full(self, size: int) -> bool:
@@ -118,8 +118,8 @@ class FrameQueue:
 
     def _count(self, frame: QueuedFrame, change: int) -> None:
         self._bytes += change * len(frame.raw)
-        if frame.kind is MessageKind.ORDER:
-            self._order_count += change
+        if frame.kind.expires:
+            self._expiring_count += change
         elif frame.kind is MessageKind.TELEMETRY:
             self._telemetry_count += change
 
@@ -256,12 +256,15 @@ class Port:
         return self._may_queue and (bool(self._queue) or self._is_full())
 
     def enqueue(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        message_type = self._dialect.get(plan.message_id)
-        kind = MessageKind.TRANSFER  # An unknown message may be part of a transfer, so it is never replaced.
-        if message_type is not None:
-            system_id, _ = plan.target
-            kind = kind_of(message_type.NAME, has_target=system_id != 0)
+        kind = self._kind_of(plan.message_id, plan.target)
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
+
+    def _kind_of(self, message_id: int, target: tuple[int, int]) -> MessageKind:
+        message_type = self._dialect.get(message_id)
+        if message_type is None:  # An unknown message may be part of a transfer, so it is never replaced.
+            return MessageKind.TRANSFER
+        system_id, _ = target
+        return kind_of(message_type.NAME, has_target=system_id != 0)
 
     def passes_rate_limit(self, key: int, interval_s: float, now: float) -> bool:
         """Return True if the rate limit allows a frame now. Otherwise count the frame as dropped.
@@ -305,7 +308,8 @@ class Port:
         self._drop(self._queue.expire(math.inf))
 
     def drop_late(self, frame: Frame, target: tuple[int, int], arrived_at: float) -> None:
-        queued = QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, arrived_at)
+        kind = self._kind_of(frame.message_id, target)
+        queued = QueuedFrame(frame.raw, kind, frame.message_id, target, arrived_at)
         self._drop([DroppedFrame("late", queued)])
 
     def close(self) -> None:

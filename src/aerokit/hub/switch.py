@@ -128,7 +128,7 @@ class Switch:
             if port.signer is not None or len(frames) != received_count:
                 data = None  # The received bytes contain more than the frames to forward.
         if now - arrived_at > ORDER_MAX_AGE_S:
-            frames = self._without_commands(port, frames, arrived_at)
+            frames = self._without_late(port, frames, arrived_at)
             data = None
         plans = self.router.route_all(ingress, frames, arrived_at, out_of_order)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
@@ -179,10 +179,10 @@ class Switch:
                 out_of_order.append(frame)
         return admitted, out_of_order
 
-    def _without_commands(self, port: Port, frames: list[Frame], arrived_at: float) -> list[Frame]:
+    def _without_late(self, port: Port, frames: list[Frame], arrived_at: float) -> list[Frame]:
         remaining = []
         for frame in frames:
-            if self._targets.is_command(frame.message_id):
+            if self._targets.expires(frame.message_id):
                 port.drop_late(frame, self._targets.target_of(frame), arrived_at)
             else:
                 remaining.append(frame)

@@ -62,8 +62,6 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
 
-    # start() sets this attribute.
-    _received_at: float
     # The first request sets this attribute.
     _sends_floats: bool
 
@@ -89,6 +87,9 @@ class MissionUpload(MissionExchange[UploadResult]):
         """True if it is unknown which of several items in flight was refused. To find out, send items one at a time."""
         self.was_started: bool = False
         """True once the vehicle has requested an item. From then on it may have overwritten items."""
+        self.was_dropped: bool = False
+        """True if the upload failed because the vehicle has dropped the transfer, e.g. in a reboot."""
+        self._is_item_refused = False
         self._restarts = 0
         self._busy_until: float | None = None
         self._reset()
@@ -107,9 +108,9 @@ class MissionUpload(MissionExchange[UploadResult]):
     @property
     def may_have_changed_items(self) -> bool:
         """True if the vehicle may have overwritten old items. False until the vehicle has requested an item."""
-        # If a partial upload fails after its first item, the vehicle has refused this item and replaced nothing.
+        # If the vehicle has refused the first item of a partial upload, it has replaced nothing.
         has_sent_only_first = self.is_partial and self._sent_end == self._first + 1
-        return self.was_started and not has_sent_only_first
+        return self.was_started and not (has_sent_only_first and self._is_item_refused)
 
     @property
     def was_sent_completely(self) -> bool:
@@ -120,17 +121,15 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def start(self, now: float) -> None:
         self._start_clock(now)
-        self._received_at = now
         self._announce_items(now)
 
     def receive(self, message: Message, now: float) -> None:
         if not self._is_ours(message):
             return
-        silence_s = now - self._received_at
-        self._received_at = now
         if isinstance(message, MissionAck):
-            # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
-            has_expired = self._vehicle_has_requested and silence_s >= TRANSFER_EXPIRY_S
+            # Without progress for long, ERROR means that the vehicle's transfer has expired: our items were lost, even
+            # if its requests arrived. The upload then starts again.
+            has_expired = self._vehicle_has_requested and now - self._progress_at >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(message.type, now)
             else:
@@ -217,7 +216,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._restart(result, now)
         elif result == MavMissionResult.ERROR and not is_refusal:
             self._on_error(now)
-        else:
+        elif not self._is_answer_to_copy(result, now):
             self._fail_as_refused(result)
 
     def _on_accepted(self, opaque_id: int, now: float) -> None:
@@ -228,6 +227,12 @@ class MissionUpload(MissionExchange[UploadResult]):
             was_last_requested = self._confirmed_end == self._end - 1
             is_confirmed = was_last_requested and not self._was_tail_repeated
             self._succeed(now, is_confirmed=is_confirmed, opaque_id=opaque_id)
+
+    def _is_answer_to_copy(self, result: int, now: float) -> bool:
+        """Return True if ArduPilot has received MISSION_WRITE_PARTIAL_LIST again. It then goes on with the transfer."""
+        # See MissionItemProtocol.cpp, handle_mission_write_partial_list. Later, another station may be transferring.
+        is_recent = now - self._progress_at < TRANSFER_EXPIRY_S
+        return result == MavMissionResult.DENIED and self.is_partial and self._vehicle_has_requested and is_recent
 
     def _on_error(self, now: float) -> None:
         # ERROR need not mean that the upload has failed. PX4 also sends it when it is busy, when MISSION_COUNT arrives
@@ -263,12 +268,15 @@ class MissionUpload(MissionExchange[UploadResult]):
         # A partial upload does not begin again, because another station may have changed the vehicle's plan since.
         if self.is_partial or self._restarts >= MAX_RESTARTS:
             self._fail_as_refused(result)
+            self._is_item_refused = False
+            self.was_dropped = True
             return
         self._restarts += 1
         self._reset()
         self._announce_items(now)
 
     def _fail_as_refused(self, result: int) -> None:
+        self._is_item_refused = result != MavMissionResult.DENIED
         self.is_refusal_ambiguous = self._sent_end - self._confirmed_end > 1
         self._reject(result, seq=self._confirmed_end if self._vehicle_has_requested else None)
 

@@ -313,8 +313,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: no mission was uploaded, the last upload failed or was for other members only, or a
-                member is unavailable or not armed. Nothing was sent.
+            OperationRejected: no mission was uploaded, the last upload failed or was for other members only, a mission
+                was replaced or its vehicle has rebooted since, or a member is unavailable or not armed. Nothing was
+                sent.
         """
         return self._loop.run(self.aio.start_missions, timeout=timeout, stagger_s=stagger_s)
 

@@ -2220,7 +2220,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     ) -> dict[str, ParameterWrite]:
         """Set the vehicle's parameters to those of a table, a dict or a parameter file.
 
-        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. Call
+        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. After a lost
+        link was reopened (``reconnect=True``), the parameters are downloaded first. Call
         ``download(refresh=True)`` first if another station may have set values that your program has not received.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back. ``"set"`` sets them one by

@@ -13,7 +13,8 @@ import pytest
 from aerokit import Position
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.connection import Connection
-from aerokit.events import LinkReport, VehicleRebooted, VehicleRecovered, VehicleSilent
+from aerokit.errors import LinkLost
+from aerokit.events import LinkInterrupted, LinkReport, VehicleRebooted, VehicleRecovered, VehicleSilent
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer, Message
 from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
 from aerokit.vehicle.commanding.context import VehicleContext
@@ -60,7 +61,7 @@ class Stage:
     """A fake connection, and the messages of a vehicle on it."""
 
     def __init__(self) -> None:
-        self.at, self.counted, self.bytes = 0.0, (0, 0), 0
+        self.at, self.slept_s, self.counted, self.bytes = 0.0, 0.0, (0, 0), 0
         self.bus, self.boot_clocks, self.sent = Bus(), dict[tuple[int, int], Any](), list[Message]()
         self.connection = cast(
             "Connection",
@@ -69,6 +70,7 @@ class Stage:
                 boot_clocks=self.boot_clocks,
                 now=lambda: self.at,
                 counts=lambda _: self.counted,
+                _slept_since=lambda _: self.slept_s,
                 statistics=lambda: [SimpleNamespace(bytes=self.bytes)],
                 send=lambda message, to: self.sent.append(message),
             ),
@@ -205,6 +207,39 @@ def test_late_message_after_order_to_reboot_is_no_reboot() -> None:
         stage.clock(61_000, after=1.0)
         assert stage.clock(61_100, after=4.1) == 0  # the link holds all messages back for four seconds
         assert stage.clock(70_000, after=5.0) == 0
+
+
+def watched_without_link(speed: int = 1) -> Watched:
+    """Return a stage whose link was lost 50 s (by the vehicle's clock) after the boot."""
+    stage = Watched()
+    for running_s in (40, 50):
+        stage.clock(1000 * running_s * speed, after=10.0)
+    (interrupt,) = stage.bus.sinks[LinkInterrupted]
+    interrupt(LinkInterrupted(stage.at, system_id=0, error=LinkLost("unplugged")))
+    return stage
+
+
+@pytest.mark.parametrize("speed", [1, 10])
+@pytest.mark.parametrize(
+    ("back_s", "reboots"),
+    [(58.1, 0), (61.9, 0), (57.8, 1), (62.2, 1), (20.0, 1), (900.0, 1)],  # 60 s ± 1.5 s ± 5 % of 10 s
+)
+def test_clock_that_does_not_continue_after_lost_link_is_reboot(speed: int, back_s: float, reboots: int) -> None:
+    stage = watched_without_link(speed)
+    stage.clock(round(1000 * back_s * speed), after=10.0)
+    assert stage.clock(round(1000 * (back_s + 0.9) * speed), after=0.9) == (back_s == 20.0)  # earlier than before
+    assert stage.clock(round(1000 * (back_s + 1.1) * speed), after=0.2) == reboots
+
+
+def test_time_asleep_during_lost_link_is_no_reboot() -> None:
+    stage = watched_without_link()
+    stage.slept_s = 3600.0
+    assert [stage.clock(1000 * running_s, after=10.0) for running_s in (3660, 3670, 3680)] == [0, 0, 0]
+
+
+def test_late_messages_after_lost_link_are_no_reboot() -> None:
+    stage = watched_without_link()
+    assert [stage.clock(1000 * running_s, after=10.0) for running_s in (51, 70, 90)] == [0, 0, 0]
 
 
 def test_timesync_request_of_vehicle_is_ignored() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
@@ -110,6 +111,8 @@ class PlanContext:
             session.connection.bus.attach(MissionAck, self._on_ack, system_id=session.system_id),
             session.connection.bus.attach_event(MissionFinished, self._on_finished),
         )
+        # After a reboot, or if the reopened link leads to another vehicle, the plans may be others.
+        session.on_reboot += [partial(self._forget_plan, cache) for cache in self.caches]
         self.tracker: MissionTracker = MissionTracker(session, self._may_end_by_landing)
         self.caches[MavMissionType.MISSION].on_forget = self.tracker.on_plan_replaced
 
@@ -124,6 +127,19 @@ class PlanContext:
     def offset_of(self, mission_type: int) -> int:
         """Return the number of the plan's first item on the vehicle: 1 if item 0 is home, else 0."""
         return int(mission_type == 0 and self.autopilot.home_is_item_0)
+
+    def may_differ(self, mission_type: int, items: Sequence[MissionItem] | None) -> bool:
+        """Return True if the vehicle may have other items now than these, which `PlanCache.items` contained before."""
+        known_items = self.caches[mission_type].items
+        if items is None or known_items is None or len(items) != len(known_items):
+            return True
+        from aerokit.missions.compare import ItemStorage, changed_items
+
+        changed_seqs = changed_items(items, known_items, ItemStorage(self.autopilot.mission_storage))
+        return any(seq >= self.offset_of(mission_type) for seq in changed_seqs)
+
+    def _forget_plan(self, cache: PlanCache) -> None:
+        cache.forget(self.now())
 
     @property
     def home(self) -> Position | None:

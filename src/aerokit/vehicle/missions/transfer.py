@@ -66,14 +66,14 @@ class PlanChannel:
         return await self._run(await self._new_upload(items, window=1))
 
     async def send_part(self, items: Sequence[MissionItem], first_seq: int) -> UploadResult | None:
-        """Replace items from ``first_seq`` on. Return None if the vehicle supports no partial uploads."""
+        """Replace items from ``first_seq`` on. Return None if all items must be sent instead."""
         exchange = await self._new_upload(items, window=1, first_seq=first_seq)
         try:
             result = await self._run(exchange)
         except MissionRejected:
-            if exchange.was_started:
+            if exchange.was_started and not exchange.was_dropped:
                 raise
-            return None  # The vehicle refused the partial upload itself, not an item.
+            return None  # The vehicle refused the partial upload itself, not an item, or has dropped it.
         self._has_changed = True
         return result
 
@@ -193,7 +193,8 @@ class PlanChannel:
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
             return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
         if is_partly_overwritten:
-            return "; the vehicle now has some new and some old items: upload again, or clear"
+            has = "may have" if is_silent else "has"
+            return f"; the vehicle now {has} some new and some old items: upload again, or clear"
         if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT removes further items.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
         return "; the vehicle still has its previous items"
@@ -373,7 +374,7 @@ class PlanTransfer(Generic[PlanT]):
         changes_before = self._cache.changes
         for part in _consecutive_ranges(changed_seqs):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
-                return False  # The vehicle does not support partial uploads.
+                return False
             vehicle_items[part.start : part.stop] = items[part.start : part.stop]
         if self._cache.changes != changes_before:  # Another station has replaced the plan meanwhile.
             return False
@@ -381,7 +382,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     async def _send_part(self, items: Sequence[MissionItem], first_seq: int, *, verify: bool) -> bool:
-        """Send consecutive items. Return False if the vehicle does not support partial uploads."""
+        """Send consecutive items. Return False if all items must be sent instead."""
         result = await self._channel.send_part(items, first_seq)
         if result is None:
             return False

@@ -54,7 +54,7 @@ class Parameters(ReadOnly):
     def __init__(self, session: Messaging, files: Files) -> None:
         self._transfers = session.transfers
         self._access = ParameterAccess(session.transfers, files)
-        session.at_close(self._access.store.attach())
+        session.at_close(*self._access.store.attach())
         session.on_reboot.append(self._access.forget)
         self._names = NameResolver(self._access)
         self._metadata: Metadata | None = None  # set by `load_metadata`
@@ -213,7 +213,8 @@ class Parameters(ReadOnly):
     ) -> dict[str, ParameterWrite]:
         """Set the vehicle's parameters to those of a table, a dict or a parameter file.
 
-        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. Call
+        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. After a lost
+        link was reopened (``reconnect=True``), the parameters are downloaded first. Call
         ``download(refresh=True)`` first if another station may have set values that your program has not received.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back. ``"set"`` sets them one by

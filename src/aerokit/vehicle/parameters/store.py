@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from aerokit.events import ParameterChanged
+from aerokit.events import LinkRestored, ParameterChanged
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import parameter_of
@@ -44,7 +44,7 @@ class ParameterStore:
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table, built when it is needed; None after a change.
         self._table: ParameterTable | None = ParameterTable()
-        # True once the whole list has arrived since the vehicle started.
+        # True once the whole list has arrived since the vehicle started, and since the link was last reopened.
         self.is_complete: bool = False
         # Increased by each value that arrives in a message, and by each reboot.
         self.updates: int = 0
@@ -89,9 +89,12 @@ class ParameterStore:
         stale = self._stale.get(name)
         return stale if stale is not None and self._transfers.connection.now() < stale.ignored_until else None
 
-    def attach(self) -> Detach:
-        transfers = self._transfers
-        return transfers.connection.bus.attach(ParamValue, self._on_param_value, system_id=transfers.system_id)
+    def attach(self) -> list[Detach]:
+        transfers, bus = self._transfers, self._transfers.connection.bus
+        return [
+            bus.attach(ParamValue, self._on_param_value, system_id=transfers.system_id),
+            bus.attach_event(LinkRestored, self._on_link_restored),
+        ]
 
     def forget(self) -> None:
         self.updates += 1
@@ -124,6 +127,10 @@ class ParameterStore:
         self.is_complete = True
         for name, parameter in self._known.items():
             self._publish(old.get(name), parameter)
+
+    def _on_link_restored(self, event: LinkRestored) -> None:
+        # Messages about changes were missed, and the link may lead to another vehicle.
+        self.is_complete = False
 
     def _on_param_value(self, message: ParamValue) -> None:
         frame = message.received_frame

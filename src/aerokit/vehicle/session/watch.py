@@ -41,6 +41,11 @@ REBOOT_CONFIRM_S = 0.2
 # expected time. A boot takes longer than this. Late messages are behind, too, so the time since boot must also be less
 # than the time since the order.
 EXPECTED_REBOOT_MIN_LAG_MS = 2000
+# When a lost link is back, the time since boot must continue to within this many seconds and this fraction of the
+# interruption. Otherwise the vehicle has rebooted, or the link leads to another vehicle. The difference must persist,
+# because the first messages may be late.
+RESUME_TOLERANCE_S, RESUME_TOLERANCE_RATIO = 1.5, 0.05
+RESUME_CONFIRM_S = 1.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
 # many seconds apart.
 CLOCK_SPAN_S = 5.0
@@ -100,6 +105,11 @@ class VehicleWatch:
         # The lowest reading of each clock whose time has decreased, until `_is_decrease_confirmed` has decided whether
         # the decrease shows a reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
+        # The last ``time_boot_ms`` before the link was lost, and its speed in ms/s; None once the clock has continued.
+        self._lost_reading: _ClockReading | None = None
+        self._lost_speed = 1000.0
+        # Time of the first reading since then that does not continue the clock; None if there is none.
+        self._resumed_at: float | None = None
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
         # The vehicle's time in the last answer to a TIMESYNC request.
@@ -148,11 +158,14 @@ class VehicleWatch:
     def _clock_speed(self) -> float:
         """Return how many milliseconds the vehicle's clock advances in a second."""
         first, last = self._first_reading, self._last_readings.get("time_boot_ms")
-        span_s = 0.0 if first is None or last is None else last.read_at - first.read_at
         # The clock of a simulation may be faster than real time.
-        if first is None or last is None or span_s <= CLOCK_SPAN_S:
+        if first is None or last is None or self._clock_span_s() <= CLOCK_SPAN_S:
             return 1000.0
-        return (last.milliseconds - first.milliseconds) / span_s
+        return (last.milliseconds - first.milliseconds) / self._clock_span_s()
+
+    def _clock_span_s(self) -> float:
+        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
+        return 0.0 if first is None or last is None else last.read_at - first.read_at
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
@@ -197,6 +210,10 @@ class VehicleWatch:
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
         self._state_tracker.mark_lost(event.at)
+        self._resumed_at = None
+        # If there is a reading, the link was lost again before the clocks were compared.
+        if self._lost_reading is None and self._clock_span_s() > CLOCK_SPAN_S:
+            self._lost_reading, self._lost_speed = self._last_readings["time_boot_ms"], self._clock_speed()
 
     def _on_boot_time(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
@@ -231,6 +248,23 @@ class VehicleWatch:
             self._decreased_readings.pop(clock, None)
         elif self._is_decrease_confirmed(clock, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
+        if clock == "time_boot_ms" and self._is_other_boot(reading):
+            self._on_reboot_detected(clock, milliseconds)
+
+    def _is_other_boot(self, reading: _ClockReading) -> bool:
+        """Return True if the clock does not continue that from before the last loss of the link."""
+        lost, speed = self._lost_reading, self._lost_speed
+        if lost is None:
+            return False
+        # While the computer sleeps, our clock stands still.
+        away_s = reading.read_at - lost.read_at + self._connection._slept_since(lost.read_at)
+        difference_ms = abs(reading.milliseconds - lost.milliseconds - speed * away_s)
+        if difference_ms <= speed * (RESUME_TOLERANCE_S + RESUME_TOLERANCE_RATIO * away_s):
+            self._lost_reading = None
+            return False
+        if self._resumed_at is None:
+            self._resumed_at = reading.read_at
+        return reading.read_at - self._resumed_at >= RESUME_CONFIRM_S
 
     def _is_expected_reboot(self, frame: Frame, previous: _ClockReading, milliseconds: int) -> bool:
         """Return True if this time since boot shows that an order to reboot was executed."""
@@ -256,7 +290,7 @@ class VehicleWatch:
         # Discard older readings. A comparison with them would show the same reboot again.
         self._last_readings = {clock: _ClockReading(milliseconds, now)}
         self._decreased_readings = {}
-        self._first_reading = None
+        self._first_reading = self._lost_reading = None
         self._last_answer = _ClockReading(0, now)
         self._reboot_ordered_at = None
         self.reboots += 1
