@@ -322,7 +322,7 @@ async def test_links_that_cannot_be_opened() -> None:
     with pytest.raises(InvalidArgument, match=r"\[\] is not allowed"):
         async with open_connection([]):
             pass
-    with pytest.raises(InvalidArgument, match="a recording cannot replace a link"):
+    with pytest.raises(InvalidArgument, match="they must all lead to vehicles"):
         async with open_connection(["udpin:127.0.0.1:0", "flight.tlog"]):
             pass
     with pytest.raises(InvalidArgument, match="not a link address"):

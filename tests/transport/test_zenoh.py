@@ -121,7 +121,7 @@ async def test_name_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
         async with serving(port, how="connect"):
             with (
                 monkeypatch.context() as patched,
-                pytest.raises(LinkOpenError, match="another program serves this name"),
+                pytest.raises(LinkOpenError, match="another program has opened a server with this name"),
             ):
                 patched.setattr(zenoh_listen, "_TOKEN_QUERY_TIMEOUT_S", 100.0)
                 patched.setattr(zenoh_listen, "_BEACON_TIMEOUT_S", 100.0)

@@ -181,7 +181,7 @@ def _link_factory(
         return lambda: target
     if target.kind == "replay":
         raise InvalidArgument(
-            f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
+            f"{address} is not allowed among several links: they must all lead to vehicles, and it is a recording"
         )
     # Only listening links get the filter, because other kinds of links refuse the argument.
     peer_filter = peers if target.kind in FILTERING_KINDS else None

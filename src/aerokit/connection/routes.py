@@ -341,8 +341,8 @@ def _sequence_matches(frame: Frame, route: _Route, silent_s: float) -> bool | No
     """Return True if a frame could be the next one of the route's peer by its sequence number. None if unknown."""
     if route.counters is None:
         return None
-    # The number may be ahead of the expected one by the frames that were sent, but lost, since the last heartbeat: at
-    # most 1.5 times those at the usual rate, plus 8.
+    # If frames were lost since the last heartbeat, the number is ahead of the expected one. At its usual rate, the peer
+    # sends `rate * silent_s` frames in that time.
     max_ahead = 8 + 1.5 * route.rate * silent_s
     # With a larger range, more than half of the 256 sequence numbers would match by chance.
     return (frame.sequence - route.counters.expected) & 0xFF <= max_ahead if max_ahead < 128 else None

@@ -155,7 +155,7 @@ class Master:
         self.mav.param_request_list_send(self.target_system, self.target_component)
 
     def param_set_send(self, parm_name: str | bytes, parm_value: float, parm_type: int | None = None) -> None:
-        """Send PARAM_SET without checking the answer; ``vehicle.parameters`` checks it."""
+        """Send PARAM_SET without waiting for the answer. To wait for it, set ``vehicle.parameters[name]``."""
         param_type = MavParamType.REAL32 if parm_type is None else parm_type
         self.mav.param_set_send(self.target_system, self.target_component, parm_name, parm_value, param_type)
 

@@ -82,7 +82,7 @@ class ParameterDownload:
             await self._request(name)
             return
         async with anyio.create_task_group() as group:
-            # Request the parameter during the download of all. The first that succeeds cancels the other.
+            # Request the parameter during the download of all parameters, and wait until either of them succeeds.
 
             async def request() -> None:
                 if await self._request(name):

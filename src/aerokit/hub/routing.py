@@ -299,7 +299,8 @@ class Router(Generic[PortT]):
             # frame. A frame that was received at the same port and in sequence is therefore no copy.
             is_copy, may_be_echo = is_out_of_order and age_s <= REPEAT_WINDOW_S, False
         else:
-            may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S  # This port existed then.
+            # The earlier frame can only have come back through a port that existed when it arrived.
+            may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S
             is_copy = may_be_echo and first_port in self._ingresses and age_s <= DUPLICATE_WINDOW_S
         if is_copy:
             return self._duplicate

@@ -20,10 +20,10 @@ _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
 # While searching for a record after garbage, ignore times before the year 2000, because zeros in a frame's header look
-# like such times. A record directly after another one may have any time, because the computer's clock may be wrong.
+# like such times. A record directly after another one may have such a time, because the computer's clock may be wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
-# A time whose first two bytes are at most these is before _LAST_TIME.
+# A quick check: every time with first bytes up to these is before _LAST_TIME.
 _MAX_TIME_PREFIX = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]
 
 

@@ -96,7 +96,7 @@ class Axis:
         self._speed = max(-1.0, min(1.0, speed)) * _MAX_SPEED_PERCENT_S
 
     def step(self, steps: float) -> None:
-        """Move by ``steps`` tenths of the range."""
+        """Change the setting by ``steps`` tenths of its range."""
         self.set(self.percent + steps * _STEP_PERCENT)
 
 

@@ -122,7 +122,7 @@ class ZenohListen(NetworkLink):
             with anyio.move_on_after(_BEACON_TIMEOUT_S):
                 await self._name_conflict.wait()
                 # Only a beacon leads here, because a time-out cancels wait() and ends the `with` block.
-                raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
+                raise LinkOpenError(f"cannot open {self.address}: another program has opened a server with this name")
         with zenoh_errors(self.address, self._zenoh):
             await open_in_thread(partial(self._serve, queue, session))
         self._is_serving = True

@@ -238,8 +238,8 @@ class CaptureLog:
             # A CAMERA_CAPTURE_STATUS that was sent before this picture does not include it. This time stamp makes
             # `_on_status` ignore such a status.
             self._count_boot_ms = message.time_boot_ms
-        # Indices begin at 0, so the camera has counted at least `index` pictures, perhaps without this one. An index
-        # far above the count is ignored, because such a camera does not number pictures as the standard says.
+        # Indices begin at 0, so at least `index` pictures were taken before this one. A camera whose index is far above
+        # its own count, or that always counts 0, does not number pictures as the standard says.
         if self._has_nonzero_count and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)

@@ -108,7 +108,7 @@ class CameraOrders:
         return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
-        """Return the key of all orders to one function of this camera, such as ``"video"``."""
+        """Return the key of one function, such as ``"video"``. A new order replaces earlier ones with its key."""
         return ("camera", self.component.component_id, self.device_id, subject)
 
     def begin_order(self, subject: str) -> Order:

@@ -90,7 +90,7 @@ class FileChannel:
     ) -> AsyncIterator[None]:
         """Wait until earlier operations have ended, then run the block as the next operation.
 
-        Raises FileTimeout with the ``missing`` ranges if this takes more than ``timeout`` seconds.
+        Raises FileTimeout with the ranges that ``missing()`` returns, if this takes more than ``timeout`` seconds.
         """
         with _limit(description, timeout, missing):
             async with self._lock:
@@ -148,7 +148,7 @@ class FileChannel:
                 with suppress(AerokitError):
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
-            except BaseException:  # A cancelled call must not wait.
+            except BaseException:  # A cancelled call must not wait until the file is closed.
                 self._close_soon(file.session, path)
                 raise
             else:
@@ -294,7 +294,7 @@ class LogChannel:
     ) -> AsyncIterator[None]:
         """Wait until earlier operations have ended, then run the block as the next operation.
 
-        Raises FileTimeout as :meth:`FileChannel.operation`.
+        Raises FileTimeout with the ranges that ``missing()`` returns, if this takes more than ``timeout`` seconds.
         """
         with _limit(description, timeout, missing):
             async with self._lock:

@@ -195,9 +195,9 @@ class StreamedMessage:
         self._cells = cells
         self._apply = apply
         self._lock = lock
-        # Offset of the instance number in `Frame.body`, None if the message has none.
+        # Offset of the instance number in `Frame.body`, which begins with the header. None if the message has none.
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
-        # From this time on, a frame is decoded when it arrives, even if no cell is read.
+        # From this time on, a frame is decoded when it arrives. Before, it is decoded only when a cell is read.
         self._decode_due_at = -math.inf
         # True while one of the cells has observers.
         self._is_watched = False
