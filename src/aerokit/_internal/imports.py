@@ -1,4 +1,4 @@
-"""Lazy package exports, and detection of a second project called aerokit in the same folder."""
+"""Lazy package exports, and detection of files of PyPI's other project called aerokit."""
 
 from __future__ import annotations
 

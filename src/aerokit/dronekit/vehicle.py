@@ -313,9 +313,9 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
 @asynccontextmanager
 async def _connected(
-    connection: Connection, timeout: float, begin: Callable[..., None], rate: float | None
+    connection: Connection, timeout: float, on_connected: Callable[..., None], rate: float | None
 ) -> AsyncIterator[AsyncVehicle]:
-    """Connect on the loop, call ``begin``, and request streams."""
+    """Connect, call ``on_connected``, and request streams. Runs in the event loop's thread."""
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = BackgroundTasks(connection.fail)
         rate_hz: float | None = None
@@ -323,8 +323,8 @@ async def _connected(
             # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
             rate_hz = min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0
         try:
-            # `begin` is a weak callback, so that this coroutine does not keep the vehicle alive.
-            begin(aio, tasks)
+            # `on_connected` is a weak callback, so that this coroutine does not keep the vehicle alive.
+            on_connected(aio, tasks)
             with nullcontext() if rate_hz is None else aio.streams(rate_hz):
                 yield aio
         finally:

@@ -219,7 +219,7 @@ class Following:
         return self._reason
 
     def raise_if_stopped(self) -> None:
-        """Raise SetpointStreamStopped if following has stopped early. Call it in the loops of the block.
+        """Raise SetpointStreamStopped if following has stopped early. Call it in loops inside the `async with` block.
 
         Raises:
             SetpointStreamStopped: following has stopped; the text has the reason.

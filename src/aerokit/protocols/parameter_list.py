@@ -146,8 +146,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         if self._refusals[index] >= MAX_REFUSALS and self._count is not None:
             for nonexistent in range(index, self._count):
                 self._window.discard(nonexistent)
-            # If parameters beyond this count were received, `_finish_when_complete` requests values again, and the
-            # answers correct the count.
+            # The count may now be too low. If a received parameter has a higher index, `_finish_when_complete` requests
+            # values again, and each answer has the vehicle's count.
             self._count = min(self._count, index)
 
     def _record_count(self, count: int, *, is_streamed: bool) -> None:

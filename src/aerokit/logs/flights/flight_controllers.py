@@ -242,7 +242,7 @@ class _BinText(Snapshot):
 
 
 class _Mode:
-    """Flight mode of a ``.bin``, as the value of the state ``mode``: only its name and number are known."""
+    """Flight mode in a ``.bin``, which has the names and numbers of modes, but no base_mode."""
 
     def __init__(self, name: str, number: int) -> None:
         self.name, self.custom_mode = str(name), int(number)

@@ -241,10 +241,12 @@ class _Reader:
 
     def _add_destinations(self) -> None:
         setpoints, destinations = self._flight.position_target, self._destinations
-        # Use destinations (POSITION_TARGET_GLOBAL_INT) only if the log has no continuous set-points.
+        # POSITION_TARGET_GLOBAL_INT has the place to which the vehicle flies. It is used only if no other message has
+        # logged the places of set-points.
         if setpoints.has("latitude_deg"):
             return
-        has_heights = setpoints.has()  # Set-points from NAV_CONTROLLER_OUTPUT have heights, but no positions.
+        # Without places, any values are the heights of NAV_CONTROLLER_OUTPUT.
+        has_heights = setpoints.has()
         rows = list(_rows_of(setpoints))
         for time, latitude, longitude, amsl, relative in _rows_of(destinations):
             heights = (NAN, NAN) if has_heights else (amsl, relative)

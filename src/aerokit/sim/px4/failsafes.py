@@ -42,7 +42,7 @@ class Px4Fence:
 
     @property
     def breaches(self) -> list[str]:
-        """Texts of the current breaches."""
+        """Texts that say how the vehicle breaches its geofence at present."""
         motion = self._px4.motion
         if round(self._px4.parameters["GF_ACTION"]) == _NO_ACTION:
             return []

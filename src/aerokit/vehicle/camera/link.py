@@ -171,7 +171,8 @@ class CameraLink(CameraOrders):
                 # Another call may have received the information while this call waited for the lock.
                 asked_number: int | None = None
                 while self._needs_information() and not self.is_trigger and self.number != asked_number:
-                    asked_number = self.number  # During the request, another camera may take the place of a guess.
+                    # During the request, another camera may be found, if the number so far was only a guess.
+                    asked_number = self.number
                     await self._request_information()
         return self.information.latest
 

@@ -206,8 +206,8 @@ class GroundCheck:
             return True  # Without a recent velocity, the report that the vehicle is on the ground is sufficient.
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
-            # The reported velocity may be wrong: if the height has not changed for STANDING_S, the vehicle stands on
-            # the ground. `current_altitude` ignores old heights, which would not change in a fall either.
+            # The reported velocity may be wrong: a vehicle that reports to be on the ground stands there if its height
+            # has not changed for STANDING_S. `current_altitude` is None if no new heights arrive.
             altitude_m = self._impact.current_altitude()
             is_known = altitude_m is not None and self._ground_altitude_m is not None
             is_still = is_known and not _has_changed(self._ground_altitude_m, altitude_m, STANDING_M)

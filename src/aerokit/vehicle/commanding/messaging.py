@@ -272,7 +272,7 @@ class MessagingActions(VehicleBase):
             self._arbiter.supersede(subjects)
 
     def _modes_of(self, message: CommandInt | CommandLong | SetMode) -> tuple[Mode, ...]:
-        """Return the modes to which the message may change; an empty tuple if that may be any mode."""
+        """Return the modes to which the message may change the vehicle; an empty tuple if that may be any mode."""
         names = self.telemetry.mode_names
         if isinstance(message, SetMode):
             has_custom_mode = message.base_mode & CUSTOM_MODE_ENABLED

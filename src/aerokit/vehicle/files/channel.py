@@ -140,7 +140,7 @@ class FileChannel:
                 await self._close(file.session, path, idle_timeout_s)
                 if attempt == MAX_OPEN_ATTEMPTS:
                     raise
-            except (OperationTimeout, ConnectionClosed, LinkError):  # Do not wait: the vehicle is not answering.
+            except (OperationTimeout, ConnectionClosed, LinkError):  # No answer to the request to close will arrive.
                 self._close_soon(file.session, path)
                 raise
             except Exception:
