@@ -185,6 +185,18 @@ class Clamping(FakeVehicle):
         super().store(name, min(value, 10))
 
 
+def test_parameter_writes_in_flight_fit_into_queue_of_ardupilot() -> None:
+    exchange = writes(*(Parameter(f"P{number}", 1.0, REAL32) for number in range(400)))
+    exchange.start(0.0)
+    now, most = 0.0, 0
+    while not exchange.done:
+        names = [message.param_id for message in exchange.take_outbox() if isinstance(message, m.ParamSet)]
+        most, now = max(most, len(names)), now + RTT_S
+        for name in names:
+            exchange.receive(m.ParamValue(name, 1.0, REAL32, 400, 0), now)
+    assert 20 < most <= 25
+
+
 def test_clamped_value_is_accepted() -> None:
     channel = Channel(Clamping([Parameter("A", 0, INT32)]))
     assert value(channel.run(writes(Parameter("A", 50, INT32), before={"A": 0}))["A"]) == 10

@@ -140,6 +140,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     """
 
     window_size: ClassVar[int]  # initial limit of requests in flight
+    max_window_size: ClassVar[int | None] = None  # the highest limit; None: that of `RequestWindow`
     _may_probe = False  # True to detect unknown names by a probe. No request is then sent as two copies.
 
     def __init__(
@@ -148,7 +149,10 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         super().__init__(target_system, target_component, **options)
         self._names = tuple(dict.fromkeys(names))
         self._window: RequestWindow[str] = RequestWindow(
-            self.round_trip, size=self.window_size, duplicate_last=not self._may_probe
+            self.round_trip,
+            size=self.window_size,
+            max_size=self.max_window_size,
+            duplicate_last=not self._may_probe,
         )
         self._results: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
         self._sent_at: dict[str, float] = {}

@@ -192,7 +192,9 @@ class ParameterWrites(ParameterRequests):
             write, so the value is read once more.
     """
 
-    window_size = 10  # ArduPilot saves through a queue of 30, which must not overflow while armed.
+    # ArduPilot saves through a queue of 30. If it overflows while armed, values are not saved, and an internal error
+    # prevents the next arming (AP_Param.cpp).
+    window_size, max_window_size = 10, 25
 
     def __init__(
         self,

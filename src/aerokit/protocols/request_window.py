@@ -48,15 +48,22 @@ class _Request:
 class RequestWindow(Generic[KeyT]):
     """Requests, each identified by a key, with a limit on the number in flight.
 
-    The limit is ``size`` at first, and grows while answers do not become slower. A request is repeated when its
-    answer is overdue (:class:`RoundTrip`), or when later requests were answered first. With ``duplicate_last``,
-    when only a few requests of the transfer are left, each of their attempts after the second is sent as two
-    copies.
+    The limit is ``size`` at first, and grows to ``max_size`` while answers do not become slower. A request is repeated
+    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first. ``duplicate_last``
+    sends each of the last few requests as two copies from the third attempt on.
     """
 
-    def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:
+    def __init__(
+        self,
+        round_trip: RoundTrip,
+        *,
+        size: int = DEFAULT_SIZE,
+        max_size: int | None = None,
+        duplicate_last: bool = True,
+    ) -> None:
         self._round_trip = round_trip
         self._initial_size = size
+        self._max_size = MAX_GROWTH * size if max_size is None else max_size
         self._max_in_flight = size
         self._fastest_s = math.inf
         self._duplicate_last = duplicate_last
@@ -174,7 +181,7 @@ class RequestWindow(Generic[KeyT]):
         self._round_trip.add_sample(seconds)
         self._fastest_s = min(self._fastest_s, seconds)
         if seconds <= QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
-            self._max_in_flight = min(self._max_in_flight + 1, MAX_GROWTH * self._initial_size)
+            self._max_in_flight = min(self._max_in_flight + 1, self._max_size)
         else:
             self._max_in_flight = max(self._max_in_flight - 1, self._initial_size)
 
