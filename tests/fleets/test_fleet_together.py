@@ -287,6 +287,64 @@ async def test_start_missions_after_plan_was_replaced_starts_none(cause: str) ->
         assert all(copter.motion.is_on_ground for copter in stage.copters.values())
 
 
+async def test_mission_replaced_during_upload_of_others_is_not_started() -> None:
+    async with open_stage(2) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.arm()).raise_for_errors()
+        (climb, place, landing) = mission_of(10)
+        long = Mission([climb, *[place] * 300, landing])
+        upload = asyncio.create_task(stage.fleet.upload({"north/1": long, "north/2": mission_of(10)}))
+        await anyio.sleep(0.01)
+        await stage.fleet.vehicles["north/2"].mission.upload(mission_of(20))  # begins after the fleet's upload
+        assert not upload.done()
+        await upload
+        with pytest.raises(OperationRejected, match="mission of north/2 may have been replaced"):
+            await stage.fleet.start_missions()
+
+
+async def test_mission_replaced_before_delayed_start_is_not_started() -> None:
+    async with open_stage(2) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        await stage.fleet.upload({name: mission_of(10) for name in stage.copters})
+        (await stage.fleet.arm()).raise_for_errors()
+        start = asyncio.create_task(stage.fleet.start_missions(stagger_s=5.0))
+        await anyio.sleep(2)
+        await stage.fleet.vehicles["north/2"].mission.upload(mission_of(20))
+        assert "replaced before its delayed start" in str((await start)["north/2"])
+        assert stage.mode_of("north/2") != "AUTO"
+
+
+async def test_mission_with_other_count_is_not_started() -> None:
+    """Another station has replaced the plan over a link of its own, so that no MISSION_ACK arrives here."""
+    async with open_stage(2) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        await stage.fleet.upload({name: mission_of(10) for name in stage.copters})
+        (await stage.fleet.arm()).raise_for_errors()
+        (climb, place, landing) = mission_of(10)
+        replacement = Mission([climb, place, place, landing])
+        stage.copters["north/2"].missions.replace(0, replacement.to_items(home_is_item_0=True))
+        await anyio.sleep(2)
+        with pytest.raises(OperationRejected, match="mission of north/2 may have been replaced"):
+            await stage.fleet.start_missions()
+
+
+async def test_px4_mission_with_other_id_is_not_started() -> None:
+    px4s = [SimulatedPx4(system_id=system_id, boot_time_s=1.0, seed=system_id) for system_id in (1, 2)]
+    async with simulated_link(px4s) as link, fleet({"south": link}, count=2) as both:
+        (await both.wait_ready()).raise_for_errors()
+        here = both.vehicles["south/2"].position.value
+
+        def plan(altitude_m: float) -> Mission:
+            return Mission([waypoint(here.latitude_deg, here.longitude_deg, altitude_relative_m=altitude_m)])
+
+        await both.upload({name: plan(10) for name in both.vehicles})
+        (await both.arm()).raise_for_errors()
+        px4s[1].missions.store(0, plan(50).to_items())
+        await anyio.sleep(2)
+        with pytest.raises(OperationRejected, match="mission of south/2 may have been replaced"):
+            await both.start_missions()
+
+
 async def test_upload_conflicting_missions_is_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import anyio
 
@@ -31,6 +31,12 @@ from aerokit.missions.mission import Mission
 from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 from aerokit.vehicle.state.telemetry import is_reported_on_ground
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from aerokit.missions.item import MissionItem
+    from aerokit.vehicle.missions.context import PlanContext
 
 # Starts and targets may differ by this much from those of a plan, because vehicles drift and positions are noisy.
 MAX_PLAN_DRIFT_M = 3.0
@@ -346,6 +352,7 @@ class Missions(SelectionBase):
             if deconfliction.decision == "refused":
                 raise OperationRejected(f"upload: {deconfliction.reason}; nothing was sent")
         slots = {name: anyio.Semaphore(max_concurrent) for name in self._context.networks}
+        uploaded_items: dict[str, Sequence[MissionItem] | None] = {}
 
         async def upload(member: Member) -> None:
             async with slots[member.network]:
@@ -356,16 +363,15 @@ class Missions(SelectionBase):
                 await member.vehicle.mission.upload(
                     missions[member.name], timeout=timeout, max_distance_m=max_distance_m
                 )
+                # The plan may be replaced while other members still receive theirs.
+                uploaded_items[member.name] = _plans_of(member).caches[MavMissionType.MISSION].items
 
         result = await self._run("upload", upload, names=tuple(missions))
         result.raise_for_errors()
         # If a newer upload has begun, only its missions count: they were not compared with the missions of this one.
         if self._context.newest_upload is missions:
             self._context.missions.update(missions)
-            self._context.uploaded_items = {
-                name: member.vehicle.mission._context.caches[MavMissionType.MISSION].items
-                for name, member in members.items()
-            }
+            self._context.uploaded_items = uploaded_items
         return result
 
     async def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
@@ -385,15 +391,23 @@ class Missions(SelectionBase):
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:
             raise OperationRejected(f"start_missions: members not armed: {', '.join(disarmed)}; nothing was sent")
-        plans = {name: members[name].vehicle.mission._context for name in names}
-        items = self._context.uploaded_items
-        if changed := [name for name in names if plans[name].may_differ(MavMissionType.MISSION, items[name])]:
+        uploaded_items = self._context.uploaded_items
+
+        def may_be_replaced(member: Member) -> bool:
+            return _plans_of(member).may_differ(MavMissionType.MISSION, uploaded_items[member.name])
+
+        if replaced := [name for name in names if may_be_replaced(members[name])]:
             raise OperationRejected(
-                f"start_missions: the mission of {', '.join(changed)} may have been replaced since the upload (another"
+                f"start_missions: the mission of {', '.join(replaced)} may have been replaced since the upload (another"
                 " upload, or a reboot); nothing was sent; call upload() again"
             )
 
         async def start(member: Member) -> None:
+            if may_be_replaced(member):  # The plan may be replaced while the member waits for its start.
+                raise OperationRejected(
+                    f"start_missions: the mission of {member.name} may have been replaced before its delayed start;"
+                    " nothing was sent to it; call upload() again"
+                )
             await member.vehicle.mission.start(timeout=timeout)
 
         return await self._run("mission.start", start, stagger_s=stagger_s, names=names)
@@ -471,6 +485,10 @@ class Missions(SelectionBase):
         for member in members.values():
             self._check_available(member, "missions", "nothing was sent")
         return members
+
+
+def _plans_of(member: Member) -> PlanContext:
+    return member.vehicle.mission._context
 
 
 def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path:

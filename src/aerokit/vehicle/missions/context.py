@@ -130,8 +130,15 @@ class PlanContext:
 
     def may_differ(self, mission_type: int, items: Sequence[MissionItem] | None) -> bool:
         """Return True if the vehicle may have other items now than these, which `PlanCache.items` contained before."""
-        known_items = self.caches[mission_type].items
+        cache = self.caches[mission_type]
+        known_items = cache.items
         if items is None or known_items is None or len(items) != len(known_items):
+            return True
+        # Another station may have replaced the plan over a link of its own.
+        reported_id, count = self.plan_id(mission_type, cache.updated_at), self.tracker.count
+        has_other_id = 0 not in (reported_id, cache.plan_id) and reported_id != cache.plan_id
+        is_count_newer = mission_type == MavMissionType.MISSION and count.updated_at > cache.updated_at
+        if has_other_id or (is_count_newer and count.latest != len(items) - self.offset_of(mission_type)):
             return True
         from aerokit.missions.compare import ItemStorage, changed_items
 
