@@ -117,6 +117,7 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
         ("GIMBAL_MANAGER_SET_PITCHYAW", True, MessageKind.ORDER),
         ("GPS_INPUT", False, MessageKind.MEASUREMENT),
         ("ODOMETRY", True, MessageKind.MEASUREMENT),
+        ("VISION_POSITION_DELTA", False, MessageKind.MEASUREMENT),
         ("NO_SUCH_MESSAGE", False, MessageKind.TRANSFER),
     ],
 )
