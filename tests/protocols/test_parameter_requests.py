@@ -103,9 +103,10 @@ def test_unanswered_name_is_rejected_by_probe() -> None:
     assert channel.now < 1.5
 
 
-def test_answers_to_earlier_probes_reject_no_name() -> None:
+@pytest.mark.parametrize("link_s", [RTT_S, None])
+def test_answers_to_earlier_probes_reject_no_name(link_s: float | None) -> None:
     """After a pause of the link, the answers to the probes of earlier reads arrive together."""
-    exchange = reads("PARAM_0004", probe=True, round_trip=RoundTrip(RTT_S, link_s=lambda: RTT_S))
+    exchange = reads("PARAM_0004", probe=True, round_trip=RoundTrip(RTT_S, link_s=lambda: link_s))
     exchange.start(0.0)
     for _ in range(20):
         exchange.receive(framed(m.ParamValue("PARAM_0000", 1.0, REAL32, 10, 0)), RTT_S)

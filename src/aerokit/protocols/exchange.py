@@ -350,17 +350,17 @@ class StaleAnswerFilter:
         self._round_trip = round_trip
         self._early_requests: dict[str, set[float]] = {}  # by name: send times of requests answered too early
 
-    def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
+    def is_stale(self, name: str, sent_at: float, now: float, *, may_measure: bool) -> bool:
         """Return True if ``now`` is too early for an answer to the request for ``name`` sent at ``sent_at``.
 
-        ``attempts`` is the number of transmissions of the request. For each name, True is returned for at most
+        ``may_measure`` is True if the time may be a round trip of the link. For each name, True is returned for at most
         MAX_EARLY_ANSWERS requests; after that, the vehicle counts as faster than before. The caller must also check the
         answer in other ways, because it may be meant for another station.
         """
         elapsed_s = now - sent_at
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):
             return False
-        if attempts == 1:
+        if may_measure:
             # This sample lowers `fastest_s`. If the vehicle really is this fast, its next answer is then accepted.
             self._round_trip.add_sample(elapsed_s)
         early_requests = self._early_requests.setdefault(name, set())

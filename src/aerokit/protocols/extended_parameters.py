@@ -294,7 +294,7 @@ class SettingWrite(Transfer[Setting]):
             self.round_trip.add_sample(now - self._sent_at)
 
     def _is_stale(self, now: float) -> bool:
-        return self._stale_answers.is_stale(self._name, self._sent_at, now, attempts=self._attempts)
+        return self._stale_answers.is_stale(self._name, self._sent_at, now, may_measure=self._attempts == 1)
 
 
 def _is_same(first: Setting, second: Setting) -> bool:

@@ -242,12 +242,11 @@ class NamedReads(NamedRequests[ValueT]):
         self._is_probe_wanted = False
 
     def _is_probe_answer(self, index: int, now: float) -> bool:
-        attempts = self._window.attempts(PROBE)
-        if index != PROBE_INDEX or not attempts:
+        if index != PROBE_INDEX or not self._window.attempts(PROBE):
             return False
         # After a pause of the link, the answers to earlier probes arrive together. If each of them counted, all names
-        # without an answer would be rejected at once.
-        return not self._stale_answers.is_stale(PROBE, self._sent_at[PROBE], now, attempts=attempts)
+        # without an answer would be rejected at once. The first of them must not make the others count.
+        return not self._stale_answers.is_stale(PROBE, self._sent_at[PROBE], now, may_measure=False)
 
     def _count_probe_answer(self) -> None:
         # There cannot be more answers than requests, so further answers are duplicates.

@@ -263,7 +263,7 @@ class ParameterWrites(ParameterRequests):
         """
         answers = self._repeated_answers[name]
         sent_at = self._sent_at.get(name, now)
-        if self._stale_answers.is_stale(name, sent_at, now, attempts=self._window.attempts(name)):
+        if self._stale_answers.is_stale(name, sent_at, now, may_measure=self._window.attempts(name) == 1):
             return
         answers.add(reported)
         before = self._before.get(name)  # None if unknown
