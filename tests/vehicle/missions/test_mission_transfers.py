@@ -452,3 +452,17 @@ async def test_block_exit_ends_transfers() -> None:
         await mission.upload(long_mission(3))
     with pytest.raises(ConnectionClosed):
         await mission.current.wait_until(lambda _: True)
+
+
+async def test_first_request_after_slow_timesync_is_repeated() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    answer_time, answer_list = copter.handlers[m.Timesync.ID], copter.handlers[m.MissionRequestList.ID]
+    copter.handlers[m.Timesync.ID] = lambda *request: copter.call_later(8.0, lambda: answer_time(*request))
+
+    def lose_once(*_: object) -> None:
+        copter.handlers[m.MissionRequestList.ID] = answer_list
+
+    copter.handlers[m.MissionRequestList.ID] = lose_once
+    async with open_flight(copter) as flight:
+        await anyio.sleep(20.0)
+        await flight.vehicle.mission.download()

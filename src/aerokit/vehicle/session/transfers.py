@@ -31,6 +31,10 @@ ResultT = TypeVar("ResultT")
 VERSION_TIMEOUT_S = 3.0
 BACKGROUND_COMMAND_TIMEOUT_S = 5.0
 
+# A longer round trip of TIMESYNC was probably measured while the link paused. If the time-outs were based on it, a lost
+# request would not be repeated before the transfer fails.
+MAX_FIRST_ROUND_TRIP_S = 1.5
+
 
 class Messaging(Protocol):
     """Interface that transfers need from the session of an autopilot or another component."""
@@ -102,7 +106,7 @@ class Transfers:
         if self._round_trip.smoothed_s is None:
             seconds = self._round_trip_s()
             if seconds is not None:
-                self._round_trip.add_sample(seconds)
+                self._round_trip.add_sample(min(seconds, MAX_FIRST_ROUND_TRIP_S))
         return self._round_trip
 
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
