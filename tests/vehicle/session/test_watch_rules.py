@@ -260,6 +260,15 @@ def test_late_messages_after_lost_link_are_no_reboot() -> None:
     assert [stage.clock(1000 * running_s, after=10.0) for running_s in (51, 70, 90)] == [0, 0, 0]
 
 
+def test_backlog_after_lost_link_is_no_reboot() -> None:
+    """A server that has kept the messages of the interruption delivers them within three seconds."""
+    stage = watched_without_link()
+    stage.at += 30.0
+    for number in range(30):
+        assert stage.clock(50_000 + 1100 * number) == 0
+    assert [stage.clock(83_100 + 100 * number) for number in range(20)] == [0] * 20
+
+
 def test_timesync_request_of_vehicle_is_ignored() -> None:
     stage = Watched()
     stage.receive(Timesync(100_000_000_000, 5))

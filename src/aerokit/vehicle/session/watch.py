@@ -121,8 +121,8 @@ class VehicleWatch:
         self._decreased_readings: dict[str, _ClockReading] = {}
         # ``time_boot_ms`` when the link was lost; None once the clock has continued.
         self._lost_clock: _LostClock | None = None
-        # Time of the first reading since then that does not continue the clock; None if there is none.
-        self._resumed_at: float | None = None
+        # The first reading since then that does not continue the clock; None if there is none.
+        self._resumed_reading: _ClockReading | None = None
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
         # The vehicle's time in the last answer to a TIMESYNC request.
@@ -223,7 +223,7 @@ class VehicleWatch:
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
         self._state_tracker.mark_lost(event.at)
-        self._resumed_at = None
+        self._resumed_reading = None
         first, last = self._first_reading, self._last_readings.get("time_boot_ms")
         # If there is a lost clock, the link was lost again before the clocks were compared.
         if self._lost_clock is not None or first is None or last is None:
@@ -282,9 +282,12 @@ class VehicleWatch:
         if difference_ms <= speed * tolerance_s:
             self._lost_clock = None
             return False
-        if self._resumed_at is None:
-            self._resumed_at = reading.read_at
-        return reading.read_at - self._resumed_at >= RESUME_CONFIRM_S
+        resumed = self._resumed_reading or reading
+        resumed_s = reading.read_at - resumed.read_at
+        if reading.milliseconds - resumed.milliseconds > speed * (resumed_s + RESUME_CONFIRM_S / 2):
+            resumed = reading  # The clock catches up: these messages were kept during the interruption.
+        self._resumed_reading = resumed
+        return reading.read_at - resumed.read_at >= RESUME_CONFIRM_S
 
     def _is_expected_reboot(self, frame: Frame, previous: _ClockReading, milliseconds: int) -> bool:
         """Return True if this time since boot shows that an order to reboot was executed."""
