@@ -259,7 +259,7 @@ async def test_requested_capture_is_dropped_if_series_starts_elsewhere(monkeypat
             first = await anext(captures)
 
             async def fetch(_: int) -> object:
-                captures._next_index = 7  # as `_collect` does when the camera has restarted
+                captures._next_index = 7  # as `_process_new_captures` does when the camera has restarted
                 return first
 
             monkeypatch.setattr(captures._log, "fetch", fetch)

@@ -13,6 +13,7 @@ from flight_harness import Flight
 
 from aerokit import Position
 from aerokit.errors import InvalidArgument
+from aerokit.mavlink.enums import MavType
 from aerokit.missions import Mission, RallyPoints, rally_point, waypoint
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, CircleDetector
 
@@ -92,10 +93,12 @@ async def test_plan_with_far_item_is_not_uploaded(grounded: Flight, kind: str) -
 CENTER = Position(47.0, 8.0, altitude_relative_m=60.0)
 
 
-def detects(places: Iterable[tuple[float, float, float]]) -> bool:
+def detects(places: Iterable[tuple[float, float, float]], vehicle_type: int = MavType.FIXED_WING) -> bool:
     """Return True if a vehicle at these places (metres north, east and up of the center) circles the center."""
     position = SimpleNamespace(latest=None)
-    detector = CircleDetector(cast("VehicleSession", SimpleNamespace(telemetry=SimpleNamespace(position=position))))
+    telemetry = SimpleNamespace(position=position, vtol_state=SimpleNamespace(latest=None))
+    session = SimpleNamespace(telemetry=telemetry, vehicle_type=vehicle_type)
+    detector = CircleDetector(cast("VehicleSession", session))
     detected = False
     for north_m, east_m, up_m in places:
         position.latest = CENTER.offset(north_m=north_m, east_m=east_m).replace(altitude_relative_m=60.0 + up_m)
@@ -114,7 +117,7 @@ def arc(degrees: int, radius_m: float = 150.0, *, up_m: float = 0.0) -> list[tup
         ([], False),
         (arc(170), False),
         (arc(190), True),
-        (arc(190, 15.0), False),  # a hovering copter that drifts around its target
+        (arc(190, 15.0), False),
         (arc(190, up_m=30.0), False),  # still climbing
         (arc(190) + arc(10, 300.0), False),  # gone since
         ([(50.0, east_m, 0.0) for east_m in range(-2000, 2001, 20)], False),
@@ -124,3 +127,9 @@ def arc(degrees: int, radius_m: float = 150.0, *, up_m: float = 0.0) -> list[tup
 def test_circle_around_target_is_detected(places: list[tuple[float, float, float]], expected: bool) -> None:
     assert detects(places) == expected
     assert detects((north_m, -east_m, up_m) for north_m, east_m, up_m in places) == expected  # the other direction
+
+
+@pytest.mark.parametrize("vehicle_type", [MavType.QUADROTOR, MavType.SURFACE_BOAT])
+def test_circle_of_vehicle_without_wings_is_no_arrival(vehicle_type: MavType) -> None:
+    """A boat circles a place that it misses, and a copter with a wrong compass circles its target."""
+    assert not detects(arc(190), vehicle_type)

@@ -335,6 +335,17 @@ async def test_plane_on_wide_circle_has_arrived(kind: Callable[..., Any], radius
             assert vehicle.position.value.distance_to(vehicle.home.value.position) < 250
 
 
+async def test_circle_that_is_too_tight_for_plane_is_rejected() -> None:
+    async with simulated_link(SimulatedPlane(boot_time_s=0.0)) as link, aerokit.connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.arm()
+        await vehicle.take_off(50.0, timeout=120)
+        center = vehicle.position.value.offset(north_m=300).replace(altitude_amsl_m=None, altitude_relative_m=60.0)
+        with pytest.raises(OperationRejected, match=r"loiter: the vehicle flies a circle of 2\d m instead of 15 m"):
+            await vehicle.loiter(center, radius_m=15, turns=2, timeout=600)
+        await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=10)
+
+
 async def test_figure_eight_axis_is_within_pi() -> None:
     plane = SimulatedPx4Plane(boot_time_s=0.0)
     axes_rad: list[float] = []

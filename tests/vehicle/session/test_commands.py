@@ -244,6 +244,22 @@ async def test_copy_of_ack_does_not_acknowledge_next_command(grounded: Flight) -
             await grounded.vehicle.command(SERVO, 9, 1100)
 
 
+async def test_ack_of_component_with_constant_sequence_counts_after_a_second(grounded: Flight) -> None:
+    """Its acks are as equal as copies. Its answer to the first or second repetition must count."""
+    ack = await grounded.vehicle.command(SERVO, 9, 1900)
+    grounded.copter.faults.ignore(SERVO)
+
+    async def answer_each_transmission() -> None:
+        assert ack.received_frame is not None
+        for _ in range(6):
+            await anyio.sleep(0.5)
+            grounded.wire.deliver(ack.received_frame.raw)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(answer_each_transmission)
+        await grounded.vehicle._session.commands.send_long(SERVO, 9, 1900, attempts=4, attempt_timeout=0.5)
+
+
 async def test_command_connection_ends_raises(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     async with anyio.create_task_group() as tasks:

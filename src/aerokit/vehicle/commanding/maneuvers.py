@@ -7,11 +7,17 @@ from typing import TYPE_CHECKING, Literal
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import InvalidArgument, NotSupported
-from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavType, MavVtolState, OrbitYawBehaviour, SpeedType
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavVtolState, OrbitYawBehaviour, SpeedType
 from aerokit.position import travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.follow_target import FollowTarget
-from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, POSITION_MAX_AGE_S, await_progress
+from aerokit.vehicle.commanding.progress import (
+    MAX_DISTANCE_M,
+    MAX_SILENCE_S,
+    POSITION_MAX_AGE_S,
+    await_progress,
+    is_on_wings,
+)
 from aerokit.vehicle.commanding.travel import KEEP_THROTTLE
 
 if TYPE_CHECKING:
@@ -297,10 +303,7 @@ class ManeuverActions(VehicleBase):
 
     @property
     def _is_on_wings(self) -> bool:
-        vtol_state = self.telemetry.vtol_state.latest
-        if vtol_state:  # Only a VTOL reports a state other than MAV_VTOL_STATE_UNDEFINED (0).
-            return vtol_state == MavVtolState.FW
-        return self.vehicle_type == MavType.FIXED_WING
+        return is_on_wings(self._session)
 
     async def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
         """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal import geo
 from aerokit._internal.arguments import check_range
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavFrame, MavLandedState, MavSeverity
+from aerokit.mavlink.enums import MavFrame, MavLandedState, MavSeverity, MavType, MavVtolState
 from aerokit.position import Position
 from aerokit.vehicle.state.telemetry import altitude_amsl, height_above_home
 
@@ -195,33 +195,40 @@ class StallDetector:
         return f", after it descended {self._max_altitude_m - altitude_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
 
 
+def is_on_wings(session: VehicleSession) -> bool:
+    vtol_state = session.telemetry.vtol_state.latest
+    if vtol_state:  # Only a VTOL reports a state other than MAV_VTOL_STATE_UNDEFINED (0).
+        return vtol_state == MavVtolState.FW
+    return session.vehicle_type == MavType.FIXED_WING
+
+
 # A vehicle circles a place if it has flown half a circle around it, and its distances differ by this factor at most. On
 # a straight flight past a place, they do so only for 80°.
 CIRCLE_DISTANCE_RATIO, HALF_CIRCLE_DEG = 1.3, 180.0
-# A hovering vehicle that drifts around its target does not circle it.
+# A place that is almost reached is not circled.
 MIN_CIRCLE_RADIUS_M = 20.0
 # A plane that circles a place counts as arrived within this height above or below it.
 CIRCLE_HEIGHT_M = 20.0
 
 
 class CircleDetector:
-    """Detects that a plane circles a place.
+    """Detects that a plane circles a place. Other vehicles can reach it: a boat that circles it has missed it.
 
     The radius is not compared with a parameter: planes enlarge their circles with speed and altitude, and so that their
     bank angle stays within its limit.
     """
 
     def __init__(self, session: VehicleSession) -> None:
-        self._position = session.telemetry.position
+        self._session = session
         self._min_m = self._max_m = 0.0  # smallest and largest distance since the turn began; 0: no turn has begun
         self._bearing_deg = 0.0
         self._turned_deg = 0.0  # angle by which the bearing from the place has changed, positive clockwise
         self._circle_radius_m = -math.inf  # −inf until the first half circle is complete
 
     def circles(self, place: Position) -> bool:
-        """Record the vehicle's position. Return True if the vehicle circles ``place`` at about its altitude."""
-        here = self._position.latest
-        if here is None:
+        """Record the vehicle's position. Return True if it is a plane that circles ``place`` at about its altitude."""
+        here = self._session.telemetry.position.latest
+        if here is None or not is_on_wings(self._session):
             return False
         coordinates = place.latitude_deg, place.longitude_deg, here.latitude_deg, here.longitude_deg
         distance_m, bearing_deg = geo.distance_m(*coordinates), geo.bearing_deg(*coordinates)

@@ -147,7 +147,8 @@ class RoundFlight:
                 return reason
             refusal = self._first_refusal(since=order.given_at, until=report_due_at)
             is_radius_reported = session.connection.now() > report_due_at
-            self._circle_problem = refusal or (wrong_radius if is_radius_reported else "")
+            reported_problem = refusal or (wrong_radius if is_radius_reported else "")
+            self._circle_problem = reported_problem or self._flown_radius_problem(radius_m)
             return self._circle_problem or None
 
         def stall_reason() -> str | None:
@@ -169,6 +170,20 @@ class RoundFlight:
             )
         finally:
             detach()
+
+    def _flown_radius_problem(self, radius_m: float) -> str:
+        """Return a text if a plane circles the center, but not near the ordered circle; otherwise an empty one."""
+        here = self._telemetry.position.latest
+        is_endless = math.isinf(self._rounds)  # Then the call waits for no round, so any circle will do.
+        if self._counter is None or is_endless or radius_m <= 0 or here is None:
+            return ""
+        if self._counter.is_on_path:
+            self._circle = CircleDetector(self._session)  # Only half a circle without a place on the path counts.
+            return ""
+        if not self._circle.circles(self._center):
+            return ""
+        # A plane cannot turn more tightly than its speed and its bank angle allow.
+        return f"the vehicle flies a circle of {math.hypot(*self._offset(here)):.0f} m instead of {radius_m:g} m"
 
     def _first_refusal(self, since: float, until: float) -> str:
         """Return the first status text in this time that refuses the circle; empty if there is none."""

@@ -43,7 +43,8 @@ REBOOT_CONFIRM_S = 0.2
 EXPECTED_REBOOT_MIN_LAG_MS = 2000
 # When a lost link is back, the time since boot must continue to within this many seconds and this fraction of the
 # interruption. Otherwise the vehicle has rebooted, or the link leads to another vehicle. The difference must persist,
-# because the first messages may be late.
+# because the first messages may be late. Messages from before the loss may be late by as many seconds, which makes the
+# measured speed of the clock wrong if it was observed only briefly.
 RESUME_TOLERANCE_S, RESUME_TOLERANCE_RATIO = 1.5, 0.05
 RESUME_CONFIRM_S = 1.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
@@ -56,13 +57,26 @@ MAX_OPEN_REQUESTS = 64
 
 
 class _ClockReading:
-    """A time since boot that the vehicle has reported, and our time at which the report was processed."""
+    """A time since boot that the vehicle has reported, and our time at which the report was processed.
 
-    __slots__ = ("milliseconds", "read_at")  # Created for many messages, and five times as fast as a NamedTuple.
+    ``waited_s`` is how long the report may have waited before, because the event loop was blocked.
+    """
 
-    def __init__(self, milliseconds: int, read_at: float) -> None:
+    # Created for many messages, and five times as fast as a NamedTuple.
+    __slots__ = ("milliseconds", "read_at", "waited_s")
+
+    def __init__(self, milliseconds: int, read_at: float, waited_s: float = 0.0) -> None:
         self.milliseconds = milliseconds
         self.read_at = read_at
+        self.waited_s = waited_s
+
+
+class _LostClock(NamedTuple):
+    """The vehicle's clock when the link was lost."""
+
+    last: _ClockReading
+    speed: float  # ms/s
+    tolerance_ratio: float  # by which ``speed`` may be wrong
 
 
 class VehicleWatch:
@@ -105,11 +119,10 @@ class VehicleWatch:
         # The lowest reading of each clock whose time has decreased, until `_is_decrease_confirmed` has decided whether
         # the decrease shows a reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
-        # The last ``time_boot_ms`` before the link was lost, and its speed in ms/s; None once the clock has continued.
-        self._lost_reading: _ClockReading | None = None
-        self._lost_speed = 1000.0
-        # Time of the first reading since then that does not continue the clock; None if there is none.
-        self._resumed_at: float | None = None
+        # ``time_boot_ms`` when the link was lost; None once the clock has continued.
+        self._lost_clock: _LostClock | None = None
+        # The first reading since then that does not continue the clock; None if there is none.
+        self._resumed_reading: _ClockReading | None = None
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
         # The vehicle's time in the last answer to a TIMESYNC request.
@@ -210,10 +223,15 @@ class VehicleWatch:
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
         self._state_tracker.mark_lost(event.at)
-        self._resumed_at = None
-        # If there is a reading, the link was lost again before the clocks were compared.
-        if self._lost_reading is None and self._clock_span_s() > CLOCK_SPAN_S:
-            self._lost_reading, self._lost_speed = self._last_readings["time_boot_ms"], self._clock_speed()
+        self._resumed_reading = None
+        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
+        # If there is a lost clock, the link was lost again before the clocks were compared.
+        if self._lost_clock is not None or first is None or last is None:
+            return
+        min_span_s = self._clock_span_s() - last.waited_s
+        if min_span_s > CLOCK_SPAN_S:
+            wrong_by_s = RESUME_TOLERANCE_S + first.waited_s + last.waited_s
+            self._lost_clock = _LostClock(last, self._clock_speed(), RESUME_TOLERANCE_RATIO + wrong_by_s / min_span_s)
 
     def _on_boot_time(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
@@ -236,7 +254,8 @@ class VehicleWatch:
 
         ``clock`` names the message or field with the time.
         """
-        reading = _ClockReading(milliseconds, self._now())
+        now = self._now()
+        reading = _ClockReading(milliseconds, now, now - frame.received_at)
         previous = self._last_readings.get(clock, reading)
         if self._is_expected_reboot(frame, previous, milliseconds):
             self._on_reboot_detected(clock, milliseconds)
@@ -253,18 +272,22 @@ class VehicleWatch:
 
     def _is_other_boot(self, reading: _ClockReading) -> bool:
         """Return True if the clock does not continue that from before the last loss of the link."""
-        lost, speed = self._lost_reading, self._lost_speed
-        if lost is None:
+        if self._lost_clock is None:
             return False
+        last, speed, tolerance_ratio = self._lost_clock
         # While the computer sleeps, our clock stands still.
-        away_s = reading.read_at - lost.read_at + self._connection._slept_since(lost.read_at)
-        difference_ms = abs(reading.milliseconds - lost.milliseconds - speed * away_s)
-        if difference_ms <= speed * (RESUME_TOLERANCE_S + RESUME_TOLERANCE_RATIO * away_s):
-            self._lost_reading = None
+        away_s = reading.read_at - last.read_at + self._connection._slept_since(last.read_at)
+        difference_ms = abs(reading.milliseconds - last.milliseconds - speed * away_s)
+        tolerance_s = RESUME_TOLERANCE_S + last.waited_s + reading.waited_s + tolerance_ratio * away_s
+        if difference_ms <= speed * tolerance_s:
+            self._lost_clock = None
             return False
-        if self._resumed_at is None:
-            self._resumed_at = reading.read_at
-        return reading.read_at - self._resumed_at >= RESUME_CONFIRM_S
+        resumed = self._resumed_reading or reading
+        resumed_s = reading.read_at - resumed.read_at
+        if reading.milliseconds - resumed.milliseconds > speed * (resumed_s + RESUME_CONFIRM_S / 2):
+            resumed = reading  # The clock catches up: these messages were kept during the interruption.
+        self._resumed_reading = resumed
+        return reading.read_at - resumed.read_at >= RESUME_CONFIRM_S
 
     def _is_expected_reboot(self, frame: Frame, previous: _ClockReading, milliseconds: int) -> bool:
         """Return True if this time since boot shows that an order to reboot was executed."""
@@ -290,7 +313,7 @@ class VehicleWatch:
         # Discard older readings. A comparison with them would show the same reboot again.
         self._last_readings = {clock: _ClockReading(milliseconds, now)}
         self._decreased_readings = {}
-        self._first_reading = self._lost_reading = None
+        self._first_reading = self._lost_clock = None
         self._last_answer = _ClockReading(0, now)
         self._reboot_ordered_at = None
         self.reboots += 1
