@@ -465,4 +465,4 @@ async def test_first_request_after_slow_timesync_is_repeated() -> None:
     copter.handlers[m.MissionRequestList.ID] = lose_once
     async with open_flight(copter) as flight:
         await anyio.sleep(20.0)
-        await flight.vehicle.mission.download()
+        await flight.vehicle.mission.download(method="items")
