@@ -30,6 +30,7 @@ from aerokit.errors import (
     SetpointStreamStopped,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavSeverity, MavVtolState
+from aerokit.missions import Mission, return_to_launch, waypoint
 from aerokit.sim import (
     SimulatedCopter,
     SimulatedPlane,
@@ -333,6 +334,9 @@ async def test_plane_on_wide_circle_has_arrived(kind: Callable[..., Any], radius
         if kind is SimulatedPlane:
             await vehicle.return_to_launch(timeout=200)
             assert vehicle.position.value.distance_to(vehicle.home.value.position) < 250
+            await vehicle.mission.upload(Mission([waypoint(target, altitude_relative_m=50), return_to_launch()]))
+            await vehicle.mission.start()
+            await vehicle.mission.wait_finished(timeout=200)
 
 
 async def test_circle_that_is_too_tight_for_plane_is_rejected() -> None:

@@ -13,7 +13,7 @@ from aerokit.mavlink.enums import MavCmd, MavMissionType, MavResult, MissionStat
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.ground import GroundCheck
-from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, CircleDetector, await_progress
 from aerokit.vehicle.missions.context import LANDING_PURPOSES
 from aerokit.vehicle.missions.plans import VehiclePlan
 from aerokit.vehicle.missions.stalling import MissionStallDetector
@@ -86,6 +86,7 @@ class MissionEndDetector:
             self._ending = Ending.LANDING if last_command in LANDING_PURPOSES else Ending.OTHER
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
         self._return_began_at: float | None = None  # when `_has_returned` was first called
+        self._circle = CircleDetector(session)
         # Modes in which the vehicle may land. If the last item is a landing or a return, only the mode of this item.
         self._landing_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
@@ -212,14 +213,16 @@ class MissionEndDetector:
         """Return True if the vehicle is at home, or if the first call was more than ``RETURN_TIMEOUT_S`` ago."""
         session, now = self._session, self._session.connection.now()
         if self._return_began_at is None:
-            self._return_began_at = now
+            self._return_began_at, self._circle = now, CircleDetector(session)
         if now - self._return_began_at > RETURN_TIMEOUT_S:
             return True  # The vehicle may have returned to a rally point, whose position is unknown here.
         home = session.telemetry.home.latest
         if home is None:
             return False
-        distance_m = self._vehicle_context.vehicle_position.distance_to(Position(home.latitude_deg, home.longitude_deg))
-        return distance_m <= session.autopilot.arrival_radius_m
+        place = Position(home.latitude_deg, home.longitude_deg)
+        if self._circle.circles(place):
+            return True
+        return self._vehicle_context.vehicle_position.distance_to(place) <= session.autopilot.arrival_radius_m
 
     @property
     def _is_on_ground(self) -> bool:
