@@ -452,6 +452,17 @@ def test_return_uses_nearest_rally_point(kind: int, north: float) -> None:
     assert px4.motion.north == pytest.approx(north, abs=1.0)
 
 
+def test_return_to_rally_point_with_altitude_above_sea() -> None:
+    px4, client = flying()
+    px4.parameters["RTL_TYPE"] = 1
+    x, y = place(px4, 30.0, 20.0)
+    item = MissionItem(MavCmd.NAV_RALLY_POINT, MavFrame.GLOBAL_INT, x=x, y=y, z=504.4)
+    assert px4.missions.replace(2, [item]) == MavResult.ACCEPTED
+    client.command(MavCmd.NAV_RETURN_TO_LAUNCH)
+    client.run(0.1)
+    assert "RTL: start return at 534 m (30 m above destination)\t" in "".join(client.texts)
+
+
 def test_mission_starts_at_the_item_in_param_1() -> None:
     px4, client = flying()
     places = [place(px4, north, 0.0) for north in (20.0, 40.0, 60.0)]

@@ -133,7 +133,7 @@ class Px4Host(SimulatedAutopilot):
         """Return the position of a stored item of a mission, fence or list of rally points."""
         north, east = self.frame.to_local(round(item.x), round(item.y))
         _, _, home_down = self.home
-        is_absolute = item.frame == MavFrame.GLOBAL
+        is_absolute = item.frame in (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
         down_at_zero_altitude = self.frame.origin.altitude_m if is_absolute else home_down
         return (north, east, down_at_zero_altitude - item.z)
 
