@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -23,7 +24,7 @@ from zenoh_network import HoldingProxy, eventually
 import aerokit
 from aerokit.apps.cli.main import make_parser
 from aerokit.apps.network import publishing
-from aerokit.apps.network.mqtt_publisher import _LinkPublisher
+from aerokit.apps.network.mqtt_publisher import MqttLink, _LinkPublisher, _NullReceiver, parse_broker
 from aerokit.apps.network.publishing import publisher_for
 from aerokit.errors import LinkOpenError
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -157,6 +158,22 @@ async def test_mqtt_silent_server_times_out(monkeypatch: pytest.MonkeyPatch) -> 
         for writer in writers:
             writer.close()
     await eventually(lambda: asyncio.all_tasks() <= before)
+
+
+async def test_mqtt_cancellation_at_time_out_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A scope of anyio before 4.16 loses a cancellation in the iteration of the loop in which its deadline passes.
+    monkeypatch.setattr(sys.modules["aerokit.apps.network.mqtt_publisher"], "CONNECT_TIMEOUT_S", 0.2)
+    writers: list[asyncio.StreamWriter] = []
+    async with await asyncio.start_server(lambda _r, w: writers.append(w), "127.0.0.1", 0) as silent:
+        link = MqttLink(parse_broker(address(silent.sockets[0].getsockname()[1])))
+        opening = asyncio.create_task(link.open(_NullReceiver()))
+        await eventually(lambda: link._client is not None)  # then it waits for the broker's answer
+        asyncio.get_running_loop().call_later(0.21, opening.cancel)
+        time.sleep(0.3)  # noqa: ASYNC251 - the loop is late, so it handles both times in one iteration
+        await asyncio.wait({opening})
+        assert opening.cancelled()
+        for writer in writers:
+            writer.close()
 
 
 async def test_mqtt_password_is_never_shown(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

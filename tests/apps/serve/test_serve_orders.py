@@ -15,6 +15,7 @@ from serve_stage import HOST, TOKEN, Stage, open_stage
 
 import aerokit
 from aerokit.apps.serve import make_app
+from aerokit.apps.serve.api import _REFUSAL_TIMEOUT_S
 from aerokit.apps.serve.orders import ORDERS
 from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE
 from aerokit.errors import InvalidArgument
@@ -222,6 +223,18 @@ async def test_keys_are_bounded_and_single_use(
             answer = await stage.submit("arm", Idempotency_Key=f"flood-{number:04}")
             assert answer.json()["error"] == "KeyUsed"
         assert not stage.flight.copter.is_armed
+
+
+@pytest.mark.parametrize("offset_s", [-1e-10, 1e-10])
+async def test_cancelled_request_does_not_answer(offset_s: float) -> None:
+    # A scope of anyio before 4.16 loses a cancellation in the iteration of the loop in which its deadline passes.
+    async with open_stage() as stage:
+        await stage.submit("arm")
+        loop = asyncio.get_running_loop()
+        asking = asyncio.create_task(stage.submit("take_off?wait=false", {"altitude_m": 20}))
+        loop.call_at(loop.time() + _REFUSAL_TIMEOUT_S + offset_s, asking.cancel)
+        await anyio.sleep(1.0)
+        assert asking.cancelled()
 
 
 async def test_replaced_order_names_its_successor() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from contextlib import AsyncExitStack
 from pathlib import Path
+from unittest.mock import AsyncMock
 
 import anyio
 import httpx
@@ -19,8 +21,9 @@ import aerokit
 from aerokit.apps.readiness import readiness
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
+from aerokit.apps.serve.guard import AccessControl
 from aerokit.apps.serve.served_vehicles import _thin_out, _TrackPoint, ground_station_failsafe
-from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
+from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS, StateStream
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import FrameEncoder
@@ -307,6 +310,19 @@ async def test_failed_stream_is_logged_and_closed(
         assert (await socket.next("websocket.close"))["code"] == 1011
     assert "the stream of states has failed" in caplog.text
     assert "is not JSON serializable" in caplog.text
+
+
+@pytest.mark.parametrize("offset_s", [-1e-10, 1e-10])
+async def test_cancellation_as_next_state_is_due_ends_stream(offset_s: float) -> None:
+    # A scope of anyio before 4.16 loses a cancellation in the iteration of the loop in which its deadline passes.
+    async with open_stage() as stage:
+        loop, period_s = asyncio.get_running_loop(), 1.0
+        access = AccessControl(TOKEN, open_reading=False, read_only=False)
+        stream = StateStream(stage.app._served, stage.app._orders, access)
+        sending = asyncio.create_task(stream._send_messages(AsyncMock(), period_s))
+        loop.call_at(loop.time() + period_s + offset_s, sending.cancel)
+        await anyio.sleep(2.5 * period_s)
+        assert sending.cancelled()
 
 
 async def test_client_that_sends_is_disconnected() -> None:

@@ -8,8 +8,6 @@ import ssl
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-import anyio
-
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
 from aerokit._internal.values import Snapshot
@@ -169,9 +167,11 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
+        # Before Python 3.12 `asyncio.wait_for`, and before anyio 4.16 `move_on_after`, could lose a cancellation.
+        await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
         refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it an MQTT broker?)"
-        with anyio.move_on_after(CONNECT_TIMEOUT_S):
-            refusal = await self._connect_result
+        if self._connect_result.done():
+            refusal = self._connect_result.result()
         if not refusal and client.socket() is None:
             refusal = "the broker closed the connection"
         if refusal:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import anyio
 from starlette.responses import Response
 
 from aerokit import __version__
@@ -18,6 +17,7 @@ from aerokit.apps.serve.orders import (
     ORDERS,
     SET_PARAMETER,
     UPLOAD,
+    OrderRecord,
     OrderRunner,
     OrderType,
     check_parameter,
@@ -463,8 +463,7 @@ class HttpApi:
             order_type = parameter_order(metadata)
         key = request.headers.get("idempotency-key", "").strip().strip('"')
         record = self._orders.submit(vehicle, order_type, arguments, key, seen_at(request))
-        with anyio.move_on_after(None if waits else _REFUSAL_TIMEOUT_S):
-            await record.ended.wait()
+        await _wait_until_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
         if record.problem is not None:
             return json_response(
                 {**record.problem, "order": record.to_dict()}, record.problem["status"], "application/problem+json"
@@ -505,6 +504,15 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
     fields |= {"default": to_jsonable(default), "meaning": entry.describe(parameter.value)}
     fields |= {"values": {str(value): text for value, text in entry.values.items()}, "has_bits": bool(entry.bitmask)}
     return fields
+
+
+async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
+    # Before Python 3.12 `asyncio.wait_for`, and before anyio 4.16 `move_on_after`, could lose a cancellation.
+    waiting = asyncio.ensure_future(record.ended.wait())
+    try:
+        await asyncio.wait((waiting,), timeout=timeout_s)
+    finally:
+        waiting.cancel()
 
 
 def _summary(vehicle: Vehicle) -> dict[str, Any]:

@@ -138,8 +138,12 @@ class StateStream:
                         missed = 0
                     await _send(socket, json.dumps(message, ensure_ascii=False))
                 changed.clear()
-                with anyio.move_on_after(next_snapshot_at - loop.time()):
+                # Not `move_on_after`: anyio before 4.16 could lose a cancellation at the deadline.
+                timer = loop.call_later(max(0.001, next_snapshot_at - loop.time()), changed.set)
+                try:
                     await changed.wait()
+                finally:
+                    timer.cancel()
         finally:
             stop_listening()
 
