@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.mavlink.enums import MavParamError
@@ -194,7 +194,8 @@ class ParameterWrites(ParameterRequests):
 
     # ArduPilot saves through a queue of 30. If it overflows while armed, values are not saved, and an internal error
     # prevents the next arming (AP_Param.cpp).
-    window_size, max_window_size = 10, 25
+    window_size = 10
+    max_window_size: ClassVar[int | None] = 25
 
     def __init__(
         self,
