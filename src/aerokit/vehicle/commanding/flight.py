@@ -10,7 +10,6 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavLandedState
-from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.ground import GroundCheck
@@ -308,24 +307,16 @@ class FlightActions(VehicleBase):
 
     async def _await_home(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         home = self.telemetry.home
-        arrival_radius_m = self.autopilot.arrival_radius_m
         circle = CircleDetector(self._session)
         started = self.connection.now()
 
         def distance_m() -> float:
-            if home.latest is None:
-                return math.inf
-            return self._position.distance_to(Position(home.latest.latitude_deg, home.latest.longitude_deg))
-
-        def circles_home() -> bool:
-            return home.latest is not None and circle.circles(
-                Position(home.latest.latitude_deg, home.latest.longitude_deg)
-            )
+            return math.inf if home.latest is None else self._position.distance_to(home.latest.position)
 
         def is_back() -> bool:
-            if not self._position.was_received_since(started) or order.end:
+            if home.latest is None or order.end or not self._position.was_received_since(started):
                 return False
-            return circles_home() or distance_m() <= arrival_radius_m
+            return self._position.is_at(home.latest.position, circle)
 
         def describe() -> str:
             is_known = math.isfinite(distance_m())

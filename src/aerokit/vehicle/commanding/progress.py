@@ -305,6 +305,10 @@ class VehiclePosition:
         )
         return math.hypot(along_ground_m, self.height_above(here, target))
 
+    def is_at(self, place: Position, circle: CircleDetector) -> bool:
+        """Return True if the vehicle has reached ``place``. ``circle`` detects a plane that circles it."""
+        return circle.circles(place) or self.remaining_distance(place) <= self.arrival_radius_m
+
     def check_reach(
         self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
     ) -> None:

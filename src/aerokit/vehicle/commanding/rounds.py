@@ -202,9 +202,7 @@ class RoundFlight:
         position = self._context.vehicle_position
         if self._counter is not None:
             return self._counter.is_on_path
-        if self._circle.circles(self._center):
-            return True
-        return position.remaining_distance(self._center) <= position.arrival_radius_m
+        return position.is_at(self._center, self._circle)
 
     def _count_rounds(self) -> float:
         here = self._telemetry.position.latest

@@ -10,7 +10,6 @@ import anyio
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavMissionType, MavResult, MissionState
-from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.ground import GroundCheck
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, CircleDetector, await_progress
@@ -219,10 +218,7 @@ class MissionEndDetector:
         home = session.telemetry.home.latest
         if home is None:
             return False
-        place = Position(home.latitude_deg, home.longitude_deg)
-        if self._circle.circles(place):
-            return True
-        return self._vehicle_context.vehicle_position.distance_to(place) <= session.autopilot.arrival_radius_m
+        return self._vehicle_context.vehicle_position.is_at(home.position, self._circle)
 
     @property
     def _is_on_ground(self) -> bool:
