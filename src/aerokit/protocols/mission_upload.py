@@ -230,7 +230,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _is_answer_to_copy(self, result: int, now: float) -> bool:
         """Return True if ArduPilot has received MISSION_WRITE_PARTIAL_LIST again. It then goes on with the transfer."""
-        # See MissionItemProtocol.cpp, handle_mission_write_partial_list. Later, another station may be transferring.
+        # ArduPilot then answers DENIED (MissionItemProtocol.cpp, handle_mission_write_partial_list). After
+        # TRANSFER_EXPIRY_S, DENIED may instead be about another station's transfer.
         is_recent = now - self._progress_at < TRANSFER_EXPIRY_S
         return result == MavMissionResult.DENIED and self.is_partial and self._vehicle_has_requested and is_recent
 

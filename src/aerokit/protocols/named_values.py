@@ -244,8 +244,8 @@ class NamedReads(NamedRequests[ValueT]):
     def _is_probe_answer(self, index: int, now: float) -> bool:
         if index != PROBE_INDEX or not self._window.attempts(PROBE):
             return False
-        # After a pause of the link, the answers to earlier probes arrive together. If each of them counted, all names
-        # without an answer would be rejected at once. The first of them must not make the others count.
+        # After a pause of the link, the answers to earlier probes arrive together. If all of them counted, every name
+        # without an answer would be rejected at once. `may_measure=False` keeps the first from vouching for the others.
         return not self._stale_answers.is_stale(PROBE, self._sent_at[PROBE], now, may_measure=False)
 
     def _count_probe_answer(self) -> None:

@@ -36,7 +36,7 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
     return Parameter(known.name, value, type_, default=known.default, index=index)
 
 
-# Maximum seconds between two groups of values of a list. ArduPilot sends ten groups a second, or one (MAV1_PARAMS).
+# Maximum seconds between two groups of values of a list. ArduPilot sends ten groups a second, or one (MAV1_PARAMS = 1).
 MAX_GROUP_INTERVAL_S = 1.1
 
 # If at most this many values are left in the stream, its time-out is shorter. Values that are then requested too early
@@ -230,7 +230,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             return
         names = {parameter.name for parameter in parameters}
         is_consistent = len(names) == count == len(self._parameters)  # Each name has exactly one index, and vice versa.
-        # If nothing is left to request again, the result has the inconsistent values.
+        # If `_drop_stale` drops nothing, nothing can be requested again, and the result stays inconsistent.
         if not is_consistent and self._drop_stale(count):
             self._must_request_missing = True
         else:
@@ -244,7 +244,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         indices: dict[str, int | None] = {}
         for index, parameter in enumerate(parameters):
             indices.setdefault(parameter.name, index)
-        if self._refreshes == 0:  # After a change of the list, names without an index may no longer exist.
+        if self._refreshes == 0:  # If the list has changed, the names without an index may no longer exist.
             indices.update(dict.fromkeys(name for name in self._parameters if name not in names))
         latest = self._parameters
         return [Parameter(name, latest[name].value, latest[name].type, index=index) for name, index in indices.items()]

@@ -126,7 +126,7 @@ class RequestWindow(Generic[KeyT]):
             return []
         if request.attempts == 1:
             self._measure(now - request.first_at)
-        elif not request.was_duplicated:  # It is unknown which attempt was answered. A second answer will tell.
+        elif not request.was_duplicated:  # The answer may belong to either attempt. A second answer will tell.
             self._ambiguous[key] = now - request.first_at
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():

@@ -274,7 +274,7 @@ class RunningCommands:
     def _record_result(self, command: ReceivedCommand, result: CommandResult) -> None:
         # Each sender has its own entry, because a repetition may arrive after the same command of another sender.
         key = (command.command, command.sender)
-        self._ended.pop(key, None)  # Otherwise the new entry would keep the place of the old one.
+        self._ended.pop(key, None)  # A replaced entry would keep its old place, and be removed too early.
         if len(self._ended) >= MAX_RESULTS:
             del self._ended[next(iter(self._ended))]
         self._ended[key] = EndedCommand(command, result, self._host.now)

@@ -337,7 +337,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _list(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         max_line_size = DATA_SIZE - len(self.line_end)
         lines = [*self.list_prefix, *map(_line, self._entries(self._path(request)))]
-        # A line that fits into no message becomes S ("skip"). Otherwise the answer would be EOF, the end of the list.
+        # A line that fits into no message becomes S ("skip"). Without it, the answer would be EOF, the end of the list.
         lines = [line if len(line) <= max_line_size else b"S" for line in lines]
         listing = b""
         for line in lines[request.offset :]:

@@ -385,7 +385,7 @@ class MissionServer:
             answer(_Result.INVALID)
 
     def _end_clearing(self, result: int, request: m.MissionClearAll, channel: Channel) -> None:
-        if self._clearing is request:  # Otherwise, the server was reset before the answer arrived.
+        if self._clearing is request:  # False if the server was reset before the answer arrived.
             self._clearing = None
             self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
