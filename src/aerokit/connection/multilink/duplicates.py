@@ -185,8 +185,8 @@ class MergedStreams:
         if used is None or used.is_other_hardware or not frame.has_arrived_from_route_peer_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # The copy counts for the link over which it arrived and for the link in use. If these are the same, it
-            # counts for every link with an earlier copy.
+            # A copy over another link is evidence about that link and the link in use. A copy over the link in use is
+            # evidence about each link with an earlier copy.
             may_count = link == used.link or candidate.link in (link, used.link)
             if may_count and frame.has_arrived_from_route_peer_over(candidate.link):
                 candidate.record_copy(now)

@@ -287,7 +287,7 @@ class MultiLinkRoutes:
                     received = sum(counter.received for counter in counters)
                     lost = sum(counter.lost for counter in counters)
                     candidate.record_counts(received, lost, now)
-                if now - candidate.received_at > CANDIDATE_TIMEOUT_S:  # The system is no longer received here.
+                if now - candidate.received_at > CANDIDATE_TIMEOUT_S:  # The link no longer receives the system.
                     self._counters.pop((system_id, link), None)
                     continue
                 self._probe(system_id, choice, candidate, now)
