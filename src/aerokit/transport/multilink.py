@@ -212,7 +212,7 @@ class MultiLink(Link):
             if error is None:
                 return
             logger.debug("the link still cannot be opened: %s", error)
-            # One failure is reported. That of the attempt in open() could not be: nobody had subscribed to events yet.
+            # Only the first failed retry is reported. Nobody had subscribed to events when open() failed.
             if not is_reported and isinstance(self._receiver, MemberLinkListener):
                 is_reported = True
                 self._receiver.member_link_open_failed(member.index, error)

@@ -233,7 +233,7 @@ class ReconnectingLink(Link):
             logger.debug("the link still cannot be opened: %s", error)
             return False
         if current.is_lost:  # The new link was lost while it was being opened.
-            # If the new link is a recording that has ended, so has this link, and `_receiver` is None.
+            # `_receiver` is None if the loss has ended this link, too, because the new link is a recording at its end.
             return self._receiver is None
         self._is_up = True
         if self._lost_at is not None:

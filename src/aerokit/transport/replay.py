@@ -71,7 +71,7 @@ class Replay(BaseLink):
             stamp, frame = self._next
             self._deliver(frame)
             self._advance(stamp)
-        if self._next is None:  # If the receiver has closed the link, `_lose` does nothing.
+        if self._next is None:  # `_lose` does nothing if the receiver has closed the link.
             self._lose(f"end of recording after {self.frames} frames", kind=RecordingEnded)
         else:
             self._wake_up = self._loop.call_at(max(now, self._due), self._play)
