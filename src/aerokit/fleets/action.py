@@ -226,7 +226,7 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                # `FleetContext.newest_orders`, as if this action were the newest: an action that was created meanwhile
+                # As `FleetContext.newest_orders` while this action is the newest. An action that was created meanwhile
                 # then counts as a newer order.
                 self._final_orders[member.name] = _newest_order(member), self
                 member.record_success()
@@ -367,7 +367,7 @@ class FleetAction:
             else:
                 self._policy_orders[member.name] = orders[member.name]
             has_finished = member.name in self._outcomes
-            if not (reason and has_finished):  # A member that has finished and gets no order keeps its outcome.
+            if not (reason and has_finished):  # A finished member that gets no order keeps its outcome.
                 self._set_stopped(member, failed, self._policy_orders.get(member.name))
         now, system_id = self._context.now(), failed.vehicle.system_id
         self._context.publish(

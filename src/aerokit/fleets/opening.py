@@ -383,7 +383,7 @@ class MemberConnections:
     ) -> None:
         self._has_block_failed = error is not None
         self._closing.set()
-        # While a task is still connecting, opening has failed: cancelling the tasks, without this wait, is enough.
+        # While a task is still connecting, opening has failed, and it suffices to cancel the tasks.
         are_all_connected = len(self._connected) == self._running_task_count
         if self._running_task_count and are_all_connected:
             await run_shielded(self._all_closed.wait())

@@ -357,7 +357,7 @@ class Missions(SelectionBase):
         async def upload(member: Member) -> None:
             async with slots[member.network]:
                 newest = self._context.newest_upload
-                if newest is not missions and member.name in newest:  # This may replace the newer upload's mission.
+                if newest is not missions and member.name in newest:  # This upload may replace the newer one's mission.
                     self._context.newest_upload = {}
                     self._context.missions.clear()
                 await member.vehicle.mission.upload(
