@@ -193,8 +193,8 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # A frame is no copy of an earlier frame from the same port, which is the first item of its record:
-                # their sequence numbers and checksums are equal by chance.
+                # The first item of a record is the port of the earlier frame. A frame from the same port is no copy:
+                # its sequence number and checksum are equal by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == port_number:
                     newer[identity] = record
                     plan.sender.received_at = now
@@ -299,7 +299,7 @@ class Router(Generic[PortT]):
             # frame. A frame that was received at the same port and in sequence is therefore no copy.
             is_copy, may_be_echo = is_out_of_order and age_s <= REPEAT_WINDOW_S, False
         else:
-            # The earlier frame can only have come back through a port that existed when it arrived.
+            # A port that was added after the earlier frame arrived cannot have returned it.
             may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S
             is_copy = may_be_echo and first_port in self._ingresses and age_s <= DUPLICATE_WINDOW_S
         if is_copy:
