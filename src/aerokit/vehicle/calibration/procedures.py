@@ -62,7 +62,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
             if report := parse_report(text):  # Texts that are not about a calibration are ignored.
                 reports.append(report)
 
-        # With `every_arrival`, a text that equals the previous one is also a report.
+        # Without `every_arrival`, a text that equals the previous one would not be reported.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
         def has_ended_silently() -> bool:  # `run.wait` calls it repeatedly, so it sees every state.

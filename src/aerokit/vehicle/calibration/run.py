@@ -177,7 +177,7 @@ class CalibrationRun:
             )
 
     def _send_cancel(self, command: float, *params: float) -> None:
-        # The callers have checked that the vehicle is not silent. A repetition of the command has no further effect.
+        # The callers have checked that the vehicle is not silent. It may receive this command twice without harm.
         self._cancel_sent_at = self.session.connection.now()
         self.session.commands.forget_result(int(command))
         self.session.commands.send_unconfirmed(int(command), *params)

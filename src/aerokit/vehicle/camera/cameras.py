@@ -188,7 +188,6 @@ class Cameras:
         self._context = context
         self._session = context.session
         self._components = components
-        # Maps numbers to the objects that `at` has created.
         self._cameras: dict[int, Camera] = {}
         session = context.session
         self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(

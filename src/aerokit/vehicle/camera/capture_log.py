@@ -276,7 +276,7 @@ class CaptureLog:
         for callback in tuple(self.on_capture):
             callback(capture)
         is_older = self._highest is not None and capture.index < self._highest.capture.index
-        # An older capture that did not fail is not the latest: it was requested, or arrived late.
+        # A successful capture with a lower index was requested again or arrived late, so it is not the latest one.
         if not is_older or capture.success is False:
             self._link.set_cell(self.cell, capture, message)
         if is_new:

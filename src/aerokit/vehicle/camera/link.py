@@ -135,7 +135,7 @@ class CameraLink(CameraOrders):
             return
         if not is_guess:
             self._is_number_confirmed.set()
-        if number != self.number:  # Otherwise the guess was right.
+        if number != self.number:  # The guessed number was wrong.
             self._change_number(number)
 
     def _change_number(self, number: int) -> None:

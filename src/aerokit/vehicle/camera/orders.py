@@ -293,7 +293,6 @@ class _PolledCell:
     ) -> None:
         self._now, self._cell = now, cell
         self.message_type, self.period_s = message_type, period_s
-        # Times at which the program last used the value, and at which the message was last requested.
         self.read_at = -math.inf
         self.requested_at = -math.inf
         # True if the camera does not support the message, so that it is not requested before the next reboot.
@@ -329,7 +328,7 @@ class MessageRequests:
     def __init__(self, link: CameraOrders) -> None:
         self._link = link
         self._polled: list[_PolledCell] = []
-        # Messages that the camera sends only after the older commands.
+        # Messages that this camera sends only if they are requested by the older commands.
         self._legacy_types: set[type[Message]] = set()
 
     async def request(

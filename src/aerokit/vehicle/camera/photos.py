@@ -47,7 +47,7 @@ class Shutter:
         self._sequence_number = 0  # sequence number of the photo that was ordered last
         self._lock = anyio.Lock()
         self._reports_status = False  # True once the camera has sent CAMERA_CAPTURE_STATUS
-        self._ignored_requests = False  # True once all requests for this message before an order were unanswered
+        self._ignored_requests = False  # True once the camera has answered no request for its status before an order
 
     async def request_status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
         """Request CAMERA_CAPTURE_STATUS; None if the camera does not send it."""
@@ -341,9 +341,9 @@ class PhotoInterval:
         self._received = {first.index: first}
 
     def _guess_start(self, index: int) -> None:
-        self._is_start_guessed = self._next_index is None  # False once the guess was corrected.
+        self._is_start_guessed = self._next_index is None  # A second call corrects the guess.
         self._next_index = index
-        self._received.clear()  # It may contain the capture with the corrupt index.
+        self._received.clear()  # It may contain a capture with a corrupt index.
         self._newest_index = index - 1  # One less, so that `_add` accepts the capture as the newest one.
 
     def _add(self, capture: Capture) -> None:
@@ -353,7 +353,7 @@ class PhotoInterval:
         elif self._next_index is not None and capture.index >= self._next_index:
             self._received[capture.index] = capture
             if capture.index > self._newest_index:
-                if self._delivered:  # A second capture with a higher index confirms the guess.
+                if self._delivered:  # A second capture in ascending order confirms the guess.
                     self._is_start_guessed = False
                 self._set_newest(capture.index)
 

@@ -38,8 +38,8 @@ def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
 
     ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed.
     """
-    # A HEARTBEAT that reports disarmed after this delay shows that the order had no effect: another party has armed the
-    # vehicle later.
+    # An accepted command takes effect within this delay. If the vehicle reports disarmed later, the command had no
+    # effect, and another party has armed the vehicle afterwards.
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
@@ -72,8 +72,8 @@ class CommandArbiter:
         """Time of the last HEARTBEAT that reported disarmed."""
         self.last_arming_at: float = -math.inf
         """Time at which HEARTBEAT last changed from disarmed to armed; infinite after a reboot."""
-        # An order without commands, which records a takeover or a failsafe since the program armed the vehicle. None if
-        # another party has armed it.
+        # An order without commands, updated with each HEARTBEAT. It records whether a takeover or a failsafe has
+        # occurred since the program armed the vehicle. None if another party has armed it.
         self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders_in_progress: list[Order] = []
@@ -121,7 +121,7 @@ class CommandArbiter:
     def supersede(self, topics: Iterable[Topic]) -> None:
         topics = tuple(topics)
         self._ordered_since_disarmed.update(topics)
-        # An order without commands, which ends the posted orders about these topics, because it is newer.
+        # The new order has no commands. As the newest order about these topics, it ends the posted ones.
         self._set_latest(self._new_order(), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
@@ -174,7 +174,7 @@ class CommandArbiter:
         self.newest = order
         # Remove orders that have ended, so that HEARTBEATs no longer update them.
         self._orders_in_progress = [active for active in self._orders_in_progress if active.is_newest]
-        for active in self._orders_in_progress:  # A change to a mode of the new order is not a takeover.
+        for active in self._orders_in_progress:  # A change to the new order's modes is no takeover.
             active.accept_as_effects(modes, any_until=order.any_mode_until)
         self._orders_in_progress.append(order)
         return order
@@ -248,7 +248,7 @@ class CommandArbiter:
             self._notify_steering()
             arming_order = () if self._arming_order is None else (self._arming_order,)
             for previous in (*arming_order, *self._orders_in_progress):
-                if ACTION not in previous.ending_topics:  # A change to a mode of the new order is not a takeover.
+                if ACTION not in previous.ending_topics:  # A change to the new order's modes is no takeover.
                     previous.accept_as_effects(modes)
         if armed is not None:
             self._supersede_arm_commands(armed)
@@ -296,7 +296,7 @@ class CommandArbiter:
             is_done=is_done,
             slept_s=partial(self.slept_since, self._now()),
         )
-        if order.armed is None and armed is not None:  # With `order.armed`, `posted_order` has done this already.
+        if order.armed is None and armed is not None:  # `posted_order` has already done this if `order.armed` is set.
             self._supersede_arm_commands(armed)
             order.arm_command_number = self.arm_commands_sent
         self._sent_commands.append(sent)
@@ -324,7 +324,7 @@ class CommandArbiter:
         self._record_acceptance(armed, self._now())
 
     def _record_acceptance(self, armed: bool | None, accepted_at: float) -> None:
-        if armed:  # HEARTBEAT reports the effect later.
+        if armed:
             # A newer command may have been accepted before this one was abandoned.
             self._arming_accepted_at = max(self._arming_accepted_at, accepted_at)
 
@@ -368,10 +368,9 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        # After a takeover, the vehicle executes no order, unless it was posted later. A mode change after an order
-        # without modes may be the effect of this order.
+        # A takeover ends the newest order. But if this order has no modes, the mode change may be its own effect.
         was_taken_over = order is not None and bool(order.takeover_reason) and bool(order.modes) and order.is_newest
-        # A takeover does not undo an order to arm.
+        # After a takeover, a vehicle that the program has armed stays armed.
         return "arm" in topics if was_taken_over else bool(topics)
 
     @property

@@ -190,7 +190,8 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
-            # Another task may have ordered something else since, above all to disarm. One arm command is our own.
+            # False if another task has given an order meanwhile, above all to disarm. This call has sent one arm
+            # command.
             is_newest_order = (
                 self._arbiter.latest(STEERING) is order_before
                 and self._arbiter.arm_commands_sent == arm_commands_before + 1
@@ -311,7 +312,7 @@ class ArmingActions(VehicleBase):
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return arming_mode
-        # A booting vehicle may still change its mode by itself, so a change now may be lost.
+        # A booting vehicle still sets its mode by itself, and may undo a mode change of this program.
         is_booting = self.telemetry.system_status.latest in BOOT_STATES
         must_keep_mode = self._flight_cleanup.is_stream_open or is_booting
         # If a parameter decides whether the mode allows arming, try to arm first: `_arm_with_fallback_mode` changes

@@ -113,7 +113,6 @@ class FlightCleanup:
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender
         self.stop_stream: Callable[[str], None] | None = None
-        # The order whose effect a call waits for.
         self._awaited_order: Order | None = None
         self._task = BackgroundTask(session, "aerokit hold", warning_clause="before a hold was confirmed")
         # A new steering order makes the confirmation of an earlier hold pointless.
@@ -179,7 +178,7 @@ class FlightCleanup:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:
             return False
-        # If `stop_in` was abandoned, its command was probably sent, and must not be repeated without a HEARTBEAT.
+        # An order that `only_stops` was probably sent by `stop_in` already, so it is repeated only after a HEARTBEAT.
         can_send_now = self._arbiter.is_state_recent and not order.only_stops
         if can_send_now:
             command, *params = self._hold_command(mode)

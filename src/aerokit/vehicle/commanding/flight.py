@@ -174,9 +174,9 @@ class FlightActions(VehicleBase):
         # A vehicle that hovers at the altitude may be slightly below it, but not on the ground.
         tolerance_m = min(max(0.5, 0.05 * altitude_m), 0.5 * altitude_m)
         started = self.connection.now()
-        # The vehicle keeps the altitude that it climbs to when home moves: PX4 corrects the altitude of home in flight,
-        # and `set_home` may be called during the climb. The target is therefore an altitude above mean sea level:
-        # param7 of PX4's command, otherwise computed from the first known position.
+        # If home moves during the climb, the vehicle keeps its target altitude: PX4 corrects the altitude of home in
+        # flight, and `set_home` may be called. The target is therefore an altitude above mean sea level: param7 of
+        # PX4's command, or else computed from the first known position.
         target_amsl_m: float | None = plan.params[6] if self.autopilot.take_off_needs_home() else None
 
         def missing_m() -> float:

@@ -240,7 +240,7 @@ class FollowStream(SteeringStream[TargetState]):
     def _start_reading(self) -> None:
         target = self._target
         if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
-            return  # Each tick of the stream reads the target.
+            return  # No task is needed: `_tick` reads this target.
         scope = Cancellation()
         self._reading = scope
 
@@ -259,8 +259,8 @@ class FollowStream(SteeringStream[TargetState]):
                 except Exception as error:
                     self._end_reason = f"the positions of the target raised {error!r}"
                 except asyncio.CancelledError:
-                    # `_stop_reading` resets `_reading` before it cancels `scope`. Otherwise the iterator itself has
-                    # raised CancelledError, because it awaits a cancelled task.
+                    # `_stop_reading` resets `_reading` before it cancels `scope`. If `_reading` is not reset, the
+                    # iterator itself has raised CancelledError, because it awaits a cancelled task.
                     if self._reading is scope:
                         self._end_reason = "the reading of the target was cancelled"
                     raise
@@ -321,7 +321,7 @@ class FollowStream(SteeringStream[TargetState]):
             except Exception as error:
                 self._end_reason = f"the vehicle cannot follow the position of the target: {error}"
             else:
-                self._set_at = state.reported_at  # The age of a value is the age of the target's position.
+                self._set_at = state.reported_at  # A set-point is as old as the target's position.
         super()._tick(due)  # Sends the value, or stops the stream because of `_end_reason`.
 
     def _stop_reason(self, lag: float) -> str | None:

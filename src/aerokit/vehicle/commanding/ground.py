@@ -77,7 +77,6 @@ class ImpactDetector:
         # Sink rate before the impact (None if there was none), and altitude of the vehicle at the impact.
         self._impact_sink_m_s: float | None = None
         self._impact_altitude_m: float | None = None
-        # None if it is unknown.
         self._altitude_before_descent_m: float | None = None
         # True once the vehicle was slow over ground after the impact.
         self._has_slowed = False
@@ -186,7 +185,7 @@ class GroundCheck:
 
     def fall(self) -> str | None:
         """Return a text if the vehicle fell or is falling."""
-        if self._has_rebooted:  # Its motors have stopped, and it reports neither its fall nor its former state.
+        if self._has_rebooted:  # A reboot in flight stops the motors, and the vehicle does not report its fall.
             return "the vehicle rebooted"
         telemetry, reported_at = self._session.telemetry, self._ground_reported_at
         is_velocity_newer = reported_at is not None and telemetry.velocity.updated_at > reported_at

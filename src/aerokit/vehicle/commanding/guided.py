@@ -235,12 +235,12 @@ class SetpointStream(SteeringStream[SetpointT]):
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
-        # If the autopilot restarts its path at each set-point: how many more times the present set-point is sent at the
-        # stream's rate, and when it was last sent.
+        # For `_restarts_path`: how often the present set-point is still sent at the stream's rate, and when it was sent
+        # last.
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)
-        if isinstance(initial, BRAKED_BY_AUTOPILOT):  # Other set-points may stop the vehicle suddenly in the air.
+        if isinstance(initial, BRAKED_BY_AUTOPILOT):
             self._impact = ImpactDetector(context.session.telemetry)
 
     def set(self, setpoint: SetpointT) -> None:

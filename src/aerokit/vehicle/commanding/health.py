@@ -43,7 +43,6 @@ class Health:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session, self._telemetry, self._autopilot = session, session.telemetry, session.autopilot
-        # Times at which the link was last restored, and at which the vehicle was last requested to run its checks.
         self._restored_at = -math.inf
         self._checks_requested_at = -math.inf
         session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))

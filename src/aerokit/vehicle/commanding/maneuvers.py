@@ -233,7 +233,7 @@ class ManeuverActions(VehicleBase):
             counter = TurnCounter(radius_m, clockwise=clockwise)
             command, params, mode = self._circle_command("loiter", radius_m, clockwise=clockwise)
         limits = FlightLimits(max_distance_m, timeout, max_silence_s)
-        rounds = turns or 0.0  # With 0, the flight ends after the arrival and the stay.
+        rounds = turns or 0.0  # With 0 rounds, the flight ends after the arrival and `stay_s`.
         flight = RoundFlight(self._context, "loiter", center, counter, rounds, limits, center_name="target")
         await flight.fly_by_command(
             command, params, mode, holds_at_end=False, stay_s=duration_s or 0.0, radius_m=radius_m or 0.0

@@ -269,7 +269,7 @@ class Order:
         if is_of_this_order:
             self._on_own_mode(is_change=is_change, is_settled=is_settled)
         elif is_of_earlier_order and is_settled:
-            # An earlier order of the program has changed the mode. After this, only another party can change it back.
+            # An earlier order's mode change has arrived. From now on, only another party can change the mode back.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self.any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:
@@ -284,7 +284,7 @@ class Order:
         has_taken_effect = is_change or not self._requires_mode_change
         if has_taken_effect and is_settled:
             self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.
-        elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
+        elif has_taken_effect:  # The modes of the program's earlier orders may still be reported.
             self._accepted_modes -= self._modes_before
 
     def _on_takeover(self, mode: Mode, reported_at: float) -> None:

@@ -103,7 +103,7 @@ async def await_progress(
 
 def _reasons(session: VehicleSession, reason: str, since: float) -> tuple[str, ...]:
     texts = session.telemetry.texts_since(since)
-    is_impact = reason.startswith(HIT_GROUND)  # Texts about normal progress do not explain an impact.
+    is_impact = reason.startswith(HIT_GROUND)  # Informational texts do not explain why the vehicle hit the ground.
     return tuple(text.text for text in texts if not is_impact or text.severity < MavSeverity.INFO)
 
 
@@ -202,10 +202,10 @@ def is_on_wings(session: VehicleSession) -> bool:
     return session.vehicle_type == MavType.FIXED_WING
 
 
-# A vehicle circles a place if it has flown half a circle around it, and its distances differ by this factor at most. On
-# a straight flight past a place, they do so only for 80°.
+# A vehicle circles a place if it has flown HALF_CIRCLE_DEG around it, and its largest distance was at most
+# CIRCLE_DISTANCE_RATIO times its smallest. A straight flight past a place keeps this ratio only for 80°.
 CIRCLE_DISTANCE_RATIO, HALF_CIRCLE_DEG = 1.3, 180.0
-# A place that is almost reached is not circled.
+# Closer to a place than this, a vehicle is about to arrive, and does not count as circling.
 MIN_CIRCLE_RADIUS_M = 20.0
 # A plane that circles a place counts as arrived within this height above or below it.
 CIRCLE_HEIGHT_M = 20.0
@@ -418,7 +418,7 @@ class VehiclePosition:
         """
         position, home = self._telemetry.position, self._telemetry.home
         home_m = None if home.latest is None else home.latest.altitude_amsl_m
-        if position.latest is not None and position.updated_at > home.updated_at:  # A HOME_POSITION may have been lost.
+        if position.latest is not None and position.updated_at > home.updated_at:  # `home` may be outdated.
             amsl_m, relative_m = position.latest.altitude_amsl_m, position.latest.altitude_relative_m
             home_m = home_m if amsl_m is None or relative_m is None else amsl_m - relative_m
         if target.altitude_relative_m is None or home_m is None:

@@ -71,7 +71,7 @@ class RoundFlight:
         self._circle = CircleDetector(context.session)
         self._rounds = math.inf if rounds is None else rounds
         self._limits = limits
-        # Why the vehicle does not fly the ordered circle, so that `fly_by_command` must order a hold; empty if it does.
+        # Error text if the vehicle flies another circle than the ordered one; `fly_by_command` then orders a hold.
         self._circle_problem = ""
         position = context.vehicle_position
         # The frame, x, y and z of a COMMAND_INT to the center.
@@ -174,11 +174,11 @@ class RoundFlight:
     def _flown_radius_problem(self, radius_m: float) -> str:
         """Return a text if a plane circles the center, but not near the ordered circle; otherwise an empty one."""
         here = self._telemetry.position.latest
-        is_endless = math.isinf(self._rounds)  # Then the call waits for no round, so any circle will do.
+        is_endless = math.isinf(self._rounds)  # The call waits for no round, so any circle will do.
         if self._counter is None or is_endless or radius_m <= 0 or here is None:
             return ""
         if self._counter.is_on_path:
-            self._circle = CircleDetector(self._session)  # Only half a circle without a place on the path counts.
+            self._circle = CircleDetector(self._session)  # Only a half circle that never touches the path counts.
             return ""
         if not self._circle.circles(self._center):
             return ""

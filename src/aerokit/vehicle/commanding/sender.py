@@ -154,8 +154,8 @@ class OrderSender:
             self.raise_if_slept(order)
         if self._arbiter.is_state_recent:
             return
-        # After `MAX_SILENCE_S`, the command would be too late. If the event loop was blocked for that long, HEARTBEATs
-        # that wait to be read do not change this.
+        # After `MAX_SILENCE_S`, the command would be too late. HEARTBEATs that wait to be read after a blocked event
+        # loop do not extend this time.
         with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)) as scope:
             await self._session.wait_for_heartbeat()
         if scope.cancelled_caught:
@@ -178,7 +178,7 @@ class OrderSender:
         # A command to arm is overruled by one to disarm, and the reverse.
         is_overruled = sent is not None and sent.end == SUPERSEDED and order.is_newest
         if is_overruled or self._arbiter.is_replaced(order):
-            # The time-out may have ended the wait before the newer order did. The error then lacks this reason.
+            # If the time-out ended the wait, `error` does not name the newer order yet.
             return OperationRejected(str(error) if SUPERSEDED in str(error) else f"{error}; {SUPERSEDED}")
         return error
 
@@ -205,7 +205,7 @@ class OrderSender:
         effect_due_at = accepted_at + ARM_HEARTBEAT_DELAY_S
 
         def effect_reported_after() -> float:
-            # Until the arming itself is reported, a HEARTBEAT that reports disarmed may have been sent before it.
+            # Until a HEARTBEAT has reported the arming, one that reports disarmed may be from before the arming.
             is_arming_reported = was_armed or self._arbiter.last_arming_at > started
             return started if is_arming_reported else effect_due_at
 
@@ -250,7 +250,7 @@ class OrderSender:
             # The request is sent up to four times, and all four attempts must fit into the time-out.
             await self.request_mode(mode, order, attempt_timeout=min(1.0, timeout / 4))
             acknowledged_at = self._session.connection.now()
-            if was_in_doubt:  # Earlier reports may be effects of an earlier mode change.
+            if was_in_doubt:  # HEARTBEATs before the ack may report an earlier mode change.
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
             await self.await_mode(

@@ -53,7 +53,7 @@ ZERO = (0.0, 0.0, 0.0)
 # Bits of ATTITUDE_TARGET_TYPEMASK.
 IGNORE_BODY_RATES, IGNORE_ATTITUDE = 0x07, 0x80
 ACTUATORS_PER_GROUP, MAX_BODY_RATE_DEG_S = 8, 3600.0
-# A vehicle may stand still if its set-point is slower than SLOW_M_S, or nearer than MAX_RESTING_RADII arrival radii.
+# A standstill is no stall if the set-point is slower than SLOW_M_S, or nearer than MAX_RESTING_RADII arrival radii.
 SLOW_M_S, MAX_RESTING_RADII = 0.3, 2.0
 
 

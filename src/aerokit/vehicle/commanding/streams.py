@@ -325,7 +325,7 @@ class SteeringStream(ValueStream[ValueT]):
 
     def _takeover_reason(self) -> str | None:
         if self._order is not None and not self._order.is_newest:
-            return SUPERSEDED  # The newer order may have changed the mode already.
+            return SUPERSEDED  # Checked first, because the newer order may have changed the mode.
         mode = self._session.telemetry.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
@@ -359,7 +359,7 @@ class TakeoverCheck:
         self._next_mode = next_mode
         self._mode_before = telemetry.mode.latest
         self._order_before = context.arbiter.latest(STEERING)
-        # True if the vehicle may still change to a mode of `_order_before`, e.g. of the hold after an abandoned flight.
+        # True if the vehicle may still change to a mode of `_order_before`, such as the hold after an abandoned flight.
         was_taken_over = self._order_before is not None and bool(self._order_before.takeover_reason)
         self._may_change_late = context.arbiter.mode_is_in_doubt and not was_taken_over
         # The mode change (before, after) by which a take-off ends.

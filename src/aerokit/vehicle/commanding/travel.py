@@ -135,7 +135,7 @@ class TravelActions(VehicleBase):
         try:
             with self._flight_cleanup.flying(order):
                 unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
-                if unacknowledged_target is None:  # The vehicle has converted the altitude, and keeps the result.
+                if unacknowledged_target is None:  # The vehicle keeps the altitude AMSL when home moves.
                     target = self._position.with_amsl_altitude(target)
                 is_incomplete = True
                 if speed_m_s is not None and not self._speeds_by_reposition:
@@ -407,7 +407,7 @@ class TravelActions(VehicleBase):
             raise OperationRejected(f"set_home: {SUPERSEDED}")
         here, set_at = self.telemetry.position, home.updated_at
         if here.age <= POSITION_MAX_AGE_S:
-            # The altitude of an older position is above the old home. `go_to` would order it above the new one.
+            # The altitude of an older position is relative to the old home. `go_to` would order it above the new home.
             with suppress(OperationTimeout):
                 await here.wait_until(lambda _: here.updated_at > set_at, timeout=POSITION_MAX_AGE_S)
 

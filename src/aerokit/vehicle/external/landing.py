@@ -116,7 +116,6 @@ class TargetLanding:
         # When the target was last visible, and the vehicle's height at that time.
         self._seen_at = -math.inf
         self._seen_height_m: float | None = None
-        # The lowest altitude so far, and the greatest climb above it.
         self._lowest_m = math.inf
         self._climbed_m = 0.0
         self._losses: list[TargetLoss] = []

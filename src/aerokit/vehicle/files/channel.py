@@ -174,9 +174,9 @@ class FileChannel:
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
                     continue
-                # The vehicle closes another station's session after this time. None: the error has another cause.
+                # Seconds after which the vehicle closes another station's session; None if the error has another cause.
                 session_timeout_s = SESSION_TIMEOUT_S.get(error.code)
-                # The extra second lets the default idle time-out of 10 s suffice for PX4's 10.5 s.
+                # One second is added, so that the default idle time-out of 10 s suffices for PX4's 10.5 s.
                 if has_waited or session_timeout_s is None or session_timeout_s > idle_timeout_s + 1.0:
                     raise
                 has_waited = True

@@ -262,7 +262,7 @@ class GimbalControl:
             await self._request_control()
             await self._await_confirmation(since)
         except (CommandRejected, NotSupported, BusyError):
-            # Control was not obtained, but another block may have left the release of the same control to this one.
+            # Control was not obtained. Another block that had the same control may have left its release to this block.
             self._end()
             if self._control_request.must_release:
                 release.send_soon()

@@ -328,7 +328,7 @@ class Gimbals:
         session = self._context.session
         deadline = session.connection.now() + timeout
         with anyio.move_on_after(timeout):
-            # One component may refuse, although others send the message.
+            # If one component refuses the request to all components, others may still send the message.
             with suppress(CommandRejected, CommandTimeout):
                 await session.commands.send_long(
                     MavCmd.REQUEST_MESSAGE, GimbalManagerInformation.ID, component_id=BROADCAST_COMPONENT, attempts=2

@@ -73,7 +73,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        # The placeholder has the attitude from a mount message (older firmware), which does not name a gimbal.
+        # MOUNT_STATUS and MOUNT_ORIENTATION (older firmware) name no gimbal, so the placeholder has their attitude.
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 
@@ -130,7 +130,7 @@ class GimbalOrders:
         except CommandRejected:
             self.raise_if_taken()
             was_claimed = self.claim_if_denied(command)
-            if not was_claimed:  # Control is not lacking, or `gimbal.control()` claims it.
+            if not was_claimed:  # The refusal has another reason, or a `gimbal.control()` block claims control.
                 raise
             await send()
 
@@ -273,7 +273,7 @@ class GimbalOrders:
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        # The value -2 means the sender of the command, but gives control to PX4 itself (input_mavlink.cpp).
+        # Not -2, which stands for the sender of the command: PX4 then gives control to itself (input_mavlink.cpp).
         controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         primary, secondary = (controller, unchanged) if is_primary else (unchanged, controller)

@@ -121,7 +121,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)  # This sets `_stop_error`.
         if self._stop_error is None:
-            # Create the command before `_end`: afterwards it might address another gimbal.
+            # Created before `_end`: afterwards it might address another gimbal.
             stop_command = self._zero_rates_command()
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
@@ -164,7 +164,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return SUPERSEDED if self._order is not None and not self._order.is_newest else None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        stop_command = self._zero_rates_command()  # Created before the end, as in `__aexit__`.
+        stop_command = self._zero_rates_command()  # After `super()._stop`, it might address another gimbal.
         super()._stop(reason, hold=hold)
         if hold:
             stop_command.send_soon()

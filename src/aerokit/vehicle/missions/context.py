@@ -233,7 +233,6 @@ class MissionTracker:
         self.count: StateCell[int] = new_cell("mission.count", "MISSION_CURRENT with a number of items")
         self.progress: StateCell[MissionProgress] = new_cell("mission.progress", "MISSION_CURRENT")
         session.add_timeout_hint(self.current, self.count, self.progress)
-        # The item that was reached last.
         self.reached: int | None = None
         # The item that was reached last since the last start of the mission.
         self._reached_since_start: int | None = None
@@ -242,9 +241,7 @@ class MissionTracker:
         # True if another mission has replaced that mission, and was not flown yet.
         self._was_replaced = False
         self._mode_changed_at = -math.inf
-        # Time of the report that changed `reached`.
         self._reached_at = -math.inf
-        # Time of the last report that the last item is the current one.
         self._last_item_current_at = -math.inf
         # True if the vehicle flies to the item in `reached` once more.
         self._is_approached_again = False
@@ -272,7 +269,7 @@ class MissionTracker:
     @property
     def is_present_plan_complete(self) -> bool:
         """True if the mission that is on the vehicle now was flown to its end."""
-        # After a change to the mission mode, the vehicle may fly the mission again, as the next MISSION_CURRENT shows.
+        # If the mission mode was entered after the last MISSION_CURRENT, the vehicle may be flying the mission again.
         is_outdated = self.is_in_mission_mode and self.progress.updated_at <= self._mode_changed_at
         return self.is_complete and not self._was_replaced and not is_outdated
 

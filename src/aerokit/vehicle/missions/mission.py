@@ -119,7 +119,7 @@ class MissionEndDetector:
             return True
         progress = self._tracker.progress.latest
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
-        # Without a mission state, the last item that was reached shows the end.
+        # A vehicle that does not report the state of its mission has ended it when it reaches the last item.
         return not reports_state and self._tracker.is_last_item_reached
 
     def _is_completion_final(self) -> bool:
@@ -329,7 +329,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             await vehicle_context.flight_cleanup.stop_in(mode, order)
         except (CommandRejected, OperationRejected):
-            # The vehicle does not hold. After other errors it may hold, so `_is_paused` stays True.
+            # After these two errors, the vehicle does not hold. After others it may, so `_is_paused` stays True.
             if self._order is order:
                 self._is_paused = False
             raise
@@ -359,7 +359,7 @@ class MissionControl(VehiclePlan["Mission"]):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
             raise
-        if self._order is order:  # Otherwise, another task has paused the mission again.
+        if self._order is order:  # False if another task has paused the mission since.
             self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
@@ -466,7 +466,7 @@ class MissionControl(VehiclePlan["Mission"]):
             except OperationTimeout as error:
                 if not order.end:  # The order has not ended, so the vehicle did not confirm it in time.
                     raise
-                # The item itself may have ended the order by a change of the mode: PX4 leaves MISSION for a return.
+                # The new current item may have changed the mode, which ends the order: PX4 leaves MISSION for a return.
                 if order.is_newest and await self._is_reported_soon(item, since=order.given_at):
                     return
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None

@@ -56,7 +56,6 @@ class MissionStallDetector:
         self._stall_detector = StallDetector(session)
         # The item at which the vehicle had to move at the last call; None if it was allowed to stand still.
         self._moving_item: int | None = None
-        # Time since which the vehicle has had to move at this item.
         self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:

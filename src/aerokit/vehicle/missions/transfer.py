@@ -73,7 +73,7 @@ class PlanChannel:
         except MissionRejected:
             if exchange.was_started and not exchange.was_dropped:
                 raise
-            return None  # The vehicle refused the partial upload itself, not an item, or has dropped it.
+            return None  # The vehicle refused or cancelled the partial upload itself, not one of its items.
         self._has_changed = True
         return result
 
@@ -195,7 +195,7 @@ class PlanChannel:
         if is_partly_overwritten:
             has = "may have" if is_silent else "has"
             return f"; the vehicle now {has} some new and some old items: upload again, or clear"
-        if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT removes further items.
+        if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT alone cuts the plan.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
         return "; the vehicle still has its previous items"
 

@@ -317,7 +317,7 @@ class ParameterAccess:
             with self._raised_rate(raise_rate_after_s):
                 answers = await transfers.run(exchange)
         finally:
-            # Recorded after a failed or cancelled write, too, because its answers may arrive late.
+            # Failed and cancelled writes are recorded as well, because their answers may arrive late.
             self._written_at.update(dict.fromkeys(names, transfers.connection.now()))
         for name, answer in answers.items():
             if isinstance(answer, Parameter):
@@ -345,7 +345,7 @@ class ParameterAccess:
         return known is None or written is None or not same_value(known.value, written)
 
     def _forget_written(self, names: Iterable[str]) -> None:
-        # The vehicle may have other values from now on.
+        # Until the new values are confirmed, the vehicle's values are unknown.
         for name in names:
             self.written[name] = None
             self.store.clear_stale(name)
@@ -376,7 +376,7 @@ class ParameterAccess:
         if method == "set":
             return await self.write(parameters, idle_timeout_s, on_progress)
         answers: dict[str, ParameterAnswer] = {}
-        # Another task must not write during the read-back. Its value would differ from the file, and this call would
+        # Another task must not write during the read-back. This call would take its value for a wrong one, and
         # overwrite it.
         async with self._write_lock:
             self._forget_written(_names(parameters))

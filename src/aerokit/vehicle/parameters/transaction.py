@@ -119,8 +119,8 @@ class _Block:
 
     def _with_all_bits(self, answer: Parameter) -> Parameter:
         """Return the stored parameter if it equals the answer, which may lack the last bits of a number."""
-        # If the two values differ, another station has just undone our write, and the store has ignored its message
-        # (`set_stale`).
+        # If they differ, the answer is right: another station has undone our write, and the store has ignored its
+        # message (`set_stale`).
         known = self._access.store.get(answer.name)
         return known if known is not None and same_value(float(known.value), float(answer.value)) else answer
 
@@ -157,14 +157,14 @@ class _Block:
         # If another block waits long for an answer, restore the values of this block without waiting for it.
         async with self._registry.exclusive(self._idle_timeout_s):
             to_restore = self._take_saved()
-            # Recorded before the write: a block that reads a temporary value meanwhile must save these values instead.
+            # Registered before the write, so that a block that reads a temporary value saves this value instead.
             self._registry.restored.update({param.name: param for param in to_restore})
             # A blocked event loop may have lengthened the wait. This must not use up the time to restore the values.
             waited_s = min(anyio.current_time() - began_at, self._idle_timeout_s)
             with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s - waited_s):
                 try:
-                    # Keep values that another station has changed. Without a confirmed write of ours (None), there is
-                    # no value to compare with.
+                    # Keep values that another station has changed. If no write of this program was confirmed (None),
+                    # such a change cannot be recognised.
                     confirmed = [param.name for param in to_restore if self._access.written.get(param.name) is not None]
                     present = await self._access.read(confirmed, self._idle_timeout_s)
                     to_restore = [

@@ -151,7 +151,7 @@ class NameResolver:
                 renamed = Renamed(name, other_name, rename)
                 return ResolvedParameter(name, answer, is_fresh=other_name in answers, renamed=renamed)
             if isinstance(answer, ParameterTimeout) and not isinstance(failure, ParameterTimeout):
-                failure = answer  # The vehicle may have the parameter under this name.
+                failure = answer  # A time-out outweighs a refusal: the vehicle may have `other_name`.
         return self._with_hint(failure or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
 
     def _with_hint(self, answer: ParameterFailure) -> ParameterFailure:
@@ -220,7 +220,7 @@ def outcome_of(
     is_old_value = old is not None and same_value(old.value, answer.value)
     if same_value(answer.value, sent.value):
         return "unchanged" if is_old_value else "set"
-    # A 32-bit float cannot represent all integers. Those that are sent bytewise are exact.
+    # An integer that is sent as a 32-bit float may be rounded. An integer that is sent bytewise is exact.
     is_rounded = to_float32(answer.value) == to_float32(sent.value)
     if is_old_value and (bytewise or not is_rounded):
         kept = number_text(answer.value) if math.isfinite(answer.value) else answer.value

@@ -49,7 +49,7 @@ def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
     now = connection.now()
     if message in sent.recent:
         sent_at, sender_ids = sent.recent[message]
-        # A message that the same sender passes again is sent again, because base stations repeat their position.
+        # If a sender passes a message for the second time, it is no duplicate: base stations repeat their position.
         if id(sender) not in sender_ids and now - sent_at < REPEAT_WINDOW_S:
             sender_ids.add(id(sender))
             return 0

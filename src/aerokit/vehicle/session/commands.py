@@ -275,8 +275,8 @@ class CommandSender:
                 raise
             finally:
                 del self._runs[key], self._order_statuses[key]
-                # Acks arrive in the order of their commands. The acks received so far therefore belong to the oldest
-                # pending commands.
+                # Acks arrive in the order of their commands, so those received so far answer the oldest pending
+                # commands.
                 still_pending = pending_acks[exchange.final_acks :]
                 newly_pending = [self._connection.now()] * exchange.pending_acks
                 self._add_pending_acks(key, [*still_pending, *newly_pending])
@@ -329,7 +329,7 @@ class CommandSender:
         """Record an ack's frame. Return True if an equal frame has just arrived, because the link duplicates frames."""
         earliest = frame.received_at - COPY_WINDOW_S
         is_copy = any(ack.body == frame.body and ack.received_at >= earliest for ack in self._recent_acks)
-        if not is_copy:  # The acks of a faulty component with a constant sequence number count once a second.
+        if not is_copy:  # If copies were recorded, all acks with a constant sequence number would count as copies.
             self._recent_acks.append(frame)
         return is_copy
 
@@ -337,7 +337,7 @@ class CommandSender:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         if frame is not None and self._is_copy(frame):
-            return  # Otherwise the next command with this MAV_CMD would count as acknowledged, even if it was lost.
+            return  # A copy could count as the ack of the next command with this MAV_CMD, even if that is lost.
         run = self._runs.get(key)
         is_final = ack.result != MavResult.IN_PROGRESS
         is_expected = (run is not None or key in self._pending_acks) and self.is_for_us(ack)

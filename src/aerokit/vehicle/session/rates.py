@@ -137,7 +137,6 @@ class MessageRates:
         self._commands = commands
         self._system_id = system_id
         self._component_id = component_id
-        # Maps message ids to their groups in REQUEST_DATA_STREAM.
         self._group_of_message = stream_groups
         # Maps message ids to the streams that were ever requested.
         self._streams: dict[int, _Stream] = {}
@@ -239,8 +238,8 @@ class MessageRates:
                 stream.message_type.ID,
                 interval_us,
                 component_id=self._component_id,
-                # COMMAND_ACK does not name the message. With only one attempt, `send_long` could take the late ack of a
-                # request for another message for its own.
+                # COMMAND_ACK does not name the message. With only one attempt, `send_long` would accept a late ack of a
+                # request for another message.
                 attempts=2,
             )
         except CommandRejected as error:
@@ -269,7 +268,7 @@ class MessageRates:
             stream.requested_hz = None
 
     def _mark_refused(self, stream: _Stream, hz: float, reason: str) -> None:
-        # `needed_hz` ignores refused rates, so a lower rate is requested next if a caller needs one.
+        # `needed_hz` ignores refused rates. If a caller needs a lower rate, that one is requested next.
         stream.refused_hz.add(hz)
         if stream.requested_hz is None or hz == AUTOPILOT_DEFAULT:
             stream.mark_requested(self._connection.now(), AUTOPILOT_DEFAULT)

@@ -37,14 +37,12 @@ REBOOT_MIN_DECREASE_MS = 3000
 # A decreased time shows a reboot only if it persists for this long and in at least two messages, because a single
 # message may be late.
 REBOOT_CONFIRM_S = 0.2
-# After a reboot was ordered, the vehicle counts as rebooted when its time since boot is more than this behind the
-# expected time. A boot takes longer than this. Late messages are behind, too, so the time since boot must also be less
-# than the time since the order.
+# After an order to reboot, a time since boot shows the reboot if it is more than this behind the expected time, because
+# a boot takes longer. A late message is behind as well, so the time must also be less than the time since the order.
 EXPECTED_REBOOT_MIN_LAG_MS = 2000
-# When a lost link is back, the time since boot must continue to within this many seconds and this fraction of the
-# interruption. Otherwise the vehicle has rebooted, or the link leads to another vehicle. The difference must persist,
-# because the first messages may be late. Messages from before the loss may be late by as many seconds, which makes the
-# measured speed of the clock wrong if it was observed only briefly.
+# When a lost link is back, the time since boot must have continued, with a tolerance of these seconds plus this
+# fraction of the interruption. A larger difference shows a reboot or another vehicle. It must persist for
+# RESUME_CONFIRM_S, because the first messages may be late.
 RESUME_TOLERANCE_S, RESUME_TOLERANCE_RATIO = 1.5, 0.05
 RESUME_CONFIRM_S = 1.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
@@ -95,7 +93,6 @@ class VehicleWatch:
         self._component_id = component_id
         self._now = connection.now
         self._on_reboot = on_reboot
-        # Time at which the last HEARTBEAT arrived.
         self.last_heartbeat_at: float = heartbeat_at
         # Time at which the last HEARTBEAT was processed. The first HEARTBEAT may be old, but the vehicle must not count
         # as silent at once.
@@ -110,18 +107,17 @@ class VehicleWatch:
         self._has_ended = False
         self.reboots: int = 0
         """Number of reboots detected."""
-        # The last reading of each clock of the vehicle.
         self._last_readings: dict[str, _ClockReading] = {}
         # The first reading of ``time_boot_ms`` since the start of the session or a reboot.
         self._first_reading: _ClockReading | None = None
         # The connection uses this clock to recognise a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # The lowest reading of each clock whose time has decreased, until `_is_decrease_confirmed` has decided whether
-        # the decrease shows a reboot.
+        # The lowest reading of each clock that has decreased, until `_is_decrease_confirmed` knows whether this is a
+        # reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
-        # ``time_boot_ms`` when the link was lost; None once the clock has continued.
+        # ``time_boot_ms`` when the link was lost; None once a later reading has continued it.
         self._lost_clock: _LostClock | None = None
-        # The first reading since then that does not continue the clock; None if there is none.
+        # The first reading since the link was lost that does not continue ``_lost_clock``; None if there is none.
         self._resumed_reading: _ClockReading | None = None
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
@@ -192,7 +188,7 @@ class VehicleWatch:
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Detect a reboot by the time since boot in an answer to our TIMESYNC request."""
         previous = self._last_answer
-        # If the request was sent before the previous answer arrived, the answers may be in the wrong order.
+        # If this request was sent before the previous answer arrived, the two answers may have changed places.
         if requested_at <= previous.read_at:
             return
         self._last_answer = _ClockReading(milliseconds, self._connection.now())
@@ -225,7 +221,7 @@ class VehicleWatch:
         self._state_tracker.mark_lost(event.at)
         self._resumed_reading = None
         first, last = self._first_reading, self._last_readings.get("time_boot_ms")
-        # If there is a lost clock, the link was lost again before the clocks were compared.
+        # If `_lost_clock` is set, the link was lost a second time before the clocks were compared.
         if self._lost_clock is not None or first is None or last is None:
             return
         min_span_s = self._clock_span_s() - last.waited_s
@@ -285,7 +281,7 @@ class VehicleWatch:
         resumed = self._resumed_reading or reading
         resumed_s = reading.read_at - resumed.read_at
         if reading.milliseconds - resumed.milliseconds > speed * (resumed_s + RESUME_CONFIRM_S / 2):
-            resumed = reading  # The clock catches up: these messages were kept during the interruption.
+            resumed = reading  # The clock runs too fast, so delayed messages arrive in a burst.
         self._resumed_reading = resumed
         return reading.read_at - resumed.read_at >= RESUME_CONFIRM_S
 
@@ -368,7 +364,7 @@ class LinkWatch:
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Publish a report and call ``on_tick`` once a second, until the connection ends."""
         self.request_time()
-        self._next_request_at = self._connection.now()  # The first tick sends the second request.
+        self._next_request_at = self._connection.now()  # The first iteration of the loop sends the second request.
         while self._connection.is_open:
             started = self._connection.now()
             await anyio.sleep(REPORT_PERIOD_S)

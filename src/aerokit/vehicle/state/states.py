@@ -155,7 +155,7 @@ class States:
     )
     """Health of the state estimator (EKF_STATUS_REPORT, ESTIMATOR_STATUS)."""
 
-    # ArduPilot itself sends the message only when home moves, and this one may be lost.
+    # ArduPilot sends HOME_POSITION by itself only when home moves, and that message may be lost.
     home: StateField[Home] = StateField(MessageSource("HomePosition", movement.home, hz=0.5), eager=True)
     """Home position: the place to return to (HOME_POSITION)."""
 

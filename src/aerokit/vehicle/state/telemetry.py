@@ -306,8 +306,8 @@ class Telemetry(States):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
-        # A text gets the time of its processing. After a pause of the event loop, its time of arrival may be before the
-        # time of the command that the text is about.
+        # A text gets the time at which it is processed. After a pause of the event loop, its time of arrival may be
+        # earlier than the command to which the text is the vehicle's answer.
         joins_id_0 = self.autopilot.has_status_text_id_0
         self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=joins_id_0), source)
 
