@@ -254,7 +254,7 @@ class FleetAction:
                 f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
             )
         self._last_start_at = self._context.now()
-        # Actions that still wait to start this member would otherwise treat this action's order as a newer one.
+        # Other actions that still wait to start this member must not take this action's order for a newer one.
         for action in self._context.actions:
             action._orders_before.pop(member.name, None)
         if not member.is_available:
@@ -520,7 +520,7 @@ class FleetContext:
 
     def newest_orders(self, member: Member) -> tuple[object, object]:
         """Return a value that changes whenever the program orders the member to move."""
-        # The start of an action that moves the member counts, too, because the action's order follows later.
+        # An action that moves the member counts as an order from its start on, because its order follows later.
         return _newest_order(member), self.newest_moves.get(member.name)
 
     def hold(self, member: Member, task_name: str) -> None:

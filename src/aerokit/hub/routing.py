@@ -424,8 +424,8 @@ class Router(Generic[PortT]):
                 continue
             destinations = (ingress_number,) if component is sender else component.destinations
             for number in destinations:
-                # For the other components, a port at which an autopilot is received is left out. The autopilot would
-                # otherwise get the command twice.
+                # A port at which an autopilot is received is left out for other components, because the autopilot would
+                # get the command twice.
                 reaches_autopilot = any(autopilot.is_at(number) for autopilot in autopilots)
                 if number not in numbers and (component.is_autopilot or not reaches_autopilot):
                     numbers.append(number)

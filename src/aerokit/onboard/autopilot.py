@@ -83,7 +83,7 @@ def add_autopilot(services: ComponentServices, driver: AutopilotDriver, set_flig
         set_flight_state(is_armed=is_armed)
 
     async def set_mode(_: CommandRequest, base_mode: int, custom_mode: int) -> None:
-        if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:  # ArduPilot refuses a command without this flag, too.
+        if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:  # ArduPilot refuses a command without this flag as well.
             raise InvalidArgument(f"base_mode = {base_mode} is not allowed: CUSTOM_MODE_ENABLED (1) must be set")
         await call("set_mode", custom_mode)
         set_flight_state(custom_mode=custom_mode)

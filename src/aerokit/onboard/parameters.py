@@ -295,7 +295,7 @@ class _Store:
 
 
 def _rounded_limit(limit: float | None, default: ParameterValue) -> float | None:
-    # Values are rounded to 32 bits, and so are limits. Otherwise a value at the limit could be refused.
+    # Values are rounded to 32 bits. Limits are rounded as well, because a rounded value may be beyond the exact limit.
     return to_float32(limit) if limit is not None and isinstance(default, float) else limit
 
 

@@ -225,7 +225,8 @@ class SettingWrite(Transfer[Setting]):
         elif settings_equal(reported.value, self._value):
             self._measure(now)
             self._finish(reported)
-        elif not self._is_writing and not self._is_stale(now):  # A component reports the old value while it writes.
+        # While it writes, the component may report the old value.
+        elif not self._is_writing and not self._is_stale(now):
             self._measure(now)
             self._on_unexpected_value(reported, now)
 

@@ -308,7 +308,7 @@ class FtpDownload(FtpExchange[int]):
         # Maximum number of full blocks in the burst. If the size is unknown, ArduPilot's burst length is assumed.
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # Later requests must not have the numbers of this burst, because the server could take them for repetitions.
-        # The request, a shorter last block and the NAK need one number each, too.
+        # The request, a shorter last block and the NAK also need one number each.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True

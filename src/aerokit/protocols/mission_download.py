@@ -147,7 +147,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _on_item(self, item: MissionItemInt | MissionItem, now: float) -> None:
         if self._count is None or item.seq not in self._requested_at:
             return
-        if self._request_counts[item.seq] == 1:  # After a repetition, it is unknown which request was answered.
+        if self._request_counts[item.seq] == 1:  # The answer to a repeated request measures nothing.
             self.round_trip.add_sample(now - self._requested_at[item.seq])
         del self._requested_at[item.seq]
         self._items[item.seq] = from_wire(item)

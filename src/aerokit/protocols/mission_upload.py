@@ -186,7 +186,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _confirm_items_before(self, seq: int, now: float) -> None:
         """Record that the vehicle has all items before ``seq``."""
-        if self._send_counts.get(seq - 1) == 1:  # After a repetition, it is unknown which transmission was answered.
+        if self._send_counts.get(seq - 1) == 1:  # The answer to a repeated item measures nothing.
             self._measure(now - self._sent_at[seq - 1])
         self._confirmed_end = seq
         self._attempt = 1

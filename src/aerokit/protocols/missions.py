@@ -159,7 +159,7 @@ class MissionClear(MissionExchange[None]):
         if not isinstance(message, MissionAck) or not self._is_ours(message):
             return
         if message.type == MavMissionResult.ACCEPTED:
-            if self._attempt == 1:  # After a repetition, it is unknown which transmission was answered.
+            if self._attempt == 1:  # The answer to a repeated request measures nothing.
                 self.round_trip.add_sample(now - self._sent_at)
             self._finish(None)
         elif message.type == MavMissionResult.ERROR and not self._has_error:
@@ -267,7 +267,7 @@ class SetCurrentItem(Transfer[None]):
         if before is None:
             return False
         has_moved_on = before <= self._seq < seq
-        has_jumped_back = self._seq < seq < before  # The vehicle went back to our item, and has passed it since.
+        has_jumped_back = self._seq < seq < before  # The vehicle went back, reached our item and left it.
         return has_moved_on or has_jumped_back
 
     def _send(self, now: float) -> None:

@@ -40,8 +40,8 @@ class ReceivedFrame:
         self.is_admitted: bool = False
         """True if a copy has passed the signature check."""
         self.is_delivered: bool = False
-        # One bit for each link over which a copy arrived. `_route_peer_links` has only copies from the peer to which
-        # messages for the sender go, not those of a second sender with the same ids.
+        # Bit sets of the links over which copies arrived. `_route_peer_links` counts only the peer that gets our
+        # messages to the sender, because another peer may be a second sender with the same ids.
         self._links = 1 << link
         self._route_peer_links = 0 if is_other_peer else self._links
 
@@ -181,7 +181,7 @@ class MergedStreams:
     def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
         """Count the copies of a frame as evidence that their links lead to one vehicle."""
         used, frame = choice.used, self.copies.current
-        # If the link in use did not deliver the frame, the frame may come from another vehicle.
+        # Without a copy over the link in use, the frame may come from another vehicle.
         if used is None or used.is_other_hardware or not frame.has_arrived_from_route_peer_over(used.link):
             return
         for candidate in choice.candidates.values():

@@ -326,7 +326,7 @@ class LinkChoice:
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return
-        # If the id contradicts the vehicle's id, which came over another link, this link leads to another vehicle.
+        # The vehicle's id from another link is kept if the new id contradicts it: this link leads to another vehicle.
         is_from_same_link = self._hardware_link == used.link
         if self.hardware is None or is_from_same_link or not self.hardware.contradicts(hardware):
             self.hardware, self._hardware_link = hardware, used.link

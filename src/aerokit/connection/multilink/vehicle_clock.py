@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 MAX_SAMPLES = 20
 MIN_TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
-MAX_DRIFT_S = 0.5  # Limits the tolerance, which grows during a silence. Otherwise any clock would match in the end.
-# A measured clock rate of 1 ± this value counts as 1. Otherwise the error of the rate would add up to a large error of
-# the clock during a long silence.
+MAX_DRIFT_S = 0.5  # Limits the tolerance, which grows during a silence: in the end, any clock would match.
+# A measured clock rate of 1 ± this value counts as 1. During a long silence, a small error of the measured rate would
+# add up to a large error of the clock.
 REAL_TIME_TOLERANCE = 0.05
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time

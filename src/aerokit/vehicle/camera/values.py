@@ -248,7 +248,7 @@ def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
 
 
 def storage_of(message: m.StorageInformation) -> CameraStorage:
-    is_ready = message.status == StorageStatus.READY  # Otherwise the sizes are not valid.
+    is_ready = message.status == StorageStatus.READY  # Only a ready storage has valid sizes.
     return CameraStorage(
         number=message.storage_id,
         count=message.storage_count,

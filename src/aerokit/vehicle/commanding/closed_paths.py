@@ -211,7 +211,7 @@ class LobeCounter:
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._min_along_m
         lobe = 1 if along > 0 else -1
-        # The first lobe that the vehicle reaches counts as half a figure, too.
+        # Each new lobe counts as half a figure, including the first one that the vehicle reaches.
         if self.is_on_path and lobe != self._lobe:
             self._lobe = lobe
             self.rounds += 0.5

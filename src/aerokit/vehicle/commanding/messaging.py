@@ -97,7 +97,7 @@ async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: 
         monitor.reset()
         with anyio.move_on_after(retry_interval_s):
             await monitor.must_request.wait()
-        if monitor.has_received:  # The vehicle streams, so only an event requires a new request.
+        if monitor.has_received:  # The vehicle streams, so the request need not be repeated.
             await monitor.must_request.wait()
         if monitor.must_request.is_set():
             retry_interval_s = FIRST_MESSAGE_TIMEOUT_S

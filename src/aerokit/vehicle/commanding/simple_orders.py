@@ -272,7 +272,7 @@ async def receive_once(
             is_refused = await _is_request_refused(session, message_type.ID, target)
             # After a refusal, only a message that has already arrived is returned.
             with anyio.move_on_after(0 if is_refused else 0.5):
-                async for message in messages:  # Other components may send this message, too.
+                async for message in messages:  # Other components may send the same message.
                     if message.received_frame is None or message.received_frame.component_id == target:
                         return message
             if is_refused:

@@ -302,7 +302,7 @@ class SteeringStream(ValueStream[ValueT]):
             with cleanup.flying(order):
                 await cleanup.stop_in(hold_mode, order)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
+            # The order to hold may have been lost. An OperationTimeout may be a CommandTimeout or a HeartbeatTimeout.
             cleanup.hold_in_background(order)
             raise
 

@@ -135,7 +135,7 @@ class RoiMixin(GimbalMixin):
 
         Otherwise raises as :meth:`neutral`.
         """
-        if isinstance(system_id, bool):  # True would otherwise mean system 1.
+        if isinstance(system_id, bool):  # True would mean system 1.
             raise InvalidArgument(f"system_id = {system_id} is not allowed: it must be 1 to 255")
         check_range("system_id", system_id, 1, 255)
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)

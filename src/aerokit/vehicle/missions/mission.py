@@ -132,7 +132,7 @@ class MissionEndDetector:
             return self._is_on_ground
         if self._ending is Ending.OTHER:
             return True
-        # The items are unknown. A final landing or return shows in the mode, but a little after the completion.
+        # The items are unknown. Only a mode change, a little after the completion, shows a final landing or return.
         return self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:

@@ -33,7 +33,7 @@ CacheChoice = bool | str | os.PathLike[str]
 
 # Seconds and attempts without an answer after which MAVFTP counts as unsupported, even if the vehicle advertises it.
 FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS = 2.0, 3
-# ArduPilot handles parameters every ANSWER_DELAY_S, and answers MAX_READS_AT_DEFAULT_RATE reads each time.
+# ArduPilot answers MAX_READS_AT_DEFAULT_RATE reads every ANSWER_DELAY_S while PARAM_VALUE has its default rate.
 ANSWER_DELAY_S, MAX_READS_AT_DEFAULT_RATE = 0.1, 5
 # Value of SET_MESSAGE_INTERVAL that restores the autopilot's default rate.
 DEFAULT_INTERVAL = 0

@@ -156,8 +156,8 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
     return None if value == unknown else value / divisor
 
 
-# A frame is decoded at least this often, even if the program reads no value. Otherwise, the last position before a loss
-# of the fix could be replaced, undecoded, by a frame without a position.
+# A frame is decoded at least this often, even if the program reads no value. Without this limit, the last position
+# before a loss of the fix could be replaced, undecoded, by a frame without a position.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.
