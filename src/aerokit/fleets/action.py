@@ -226,8 +226,8 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                # As `FleetContext.newest_orders` while this action is the newest. An action that was created meanwhile
-                # then counts as a newer order.
+                # The value of `FleetContext.newest_orders` while no newer action moves the member. An action that was
+                # created meanwhile then counts as a newer order.
                 self._final_orders[member.name] = _newest_order(member), self
                 member.record_success()
         finally:

@@ -185,7 +185,7 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
 
     # With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The maximum time
     # difference cuts a strip out of the unit square of (s, t). If the closest points of the whole legs are in this
-    # strip, they are the result. Otherwise the minimum is on the border of the polygon that remains of the square.
+    # strip, they are the result. If not, the minimum is on the border of the polygon that remains of the square.
     inside = _closest_inside(start_difference, vector, other_vector)
     if inside is not None and abs(time_difference(*inside)) <= slack_s:
         corners = [inside]  # a polygon that is a single point

@@ -304,8 +304,8 @@ class Router(Generic[PortT]):
             is_copy = may_be_echo and first_port in self._ingresses and age_s <= DUPLICATE_WINDOW_S
         if is_copy:
             return self._duplicate
-        # A late frame may return in a slow loop, or equal the earlier one by chance, like the first command of a
-        # restarted program. It is forwarded until several frames prove a loop.
+        # A late frame may have returned through a slow loop, or may equal the earlier frame by chance, like the first
+        # command of a restarted program. It is forwarded until several frames prove a loop.
         if may_be_echo and self._record_echo(ingress, identity >> 24, first_port, now):
             return self._loop
         newer[identity] = (first_port, newest_port, now) if may_be_echo else (number, self._newest_port, now)

@@ -209,8 +209,7 @@ class LogDownload(Transfer[int]):
         if self._received_blocks < self._requested_blocks / 2:
             self._max_range_blocks = max(self._max_range_blocks // 2, MIN_RANGE)
         elif self._requested_blocks >= self._max_range_blocks and self._stream.interval_s:
-            # There is a pause before each range. In a range of more than `useful_blocks`, this pause is negligible
-            # already.
+            # There is a pause before each range. In a range of more than `useful_blocks`, this pause is negligible.
             useful_blocks = MIN_RANGE_TIMEOUTS * self.round_trip.timeout_s() / self._stream.interval_s
             self._max_range_blocks = min(2 * self._max_range_blocks, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
 

@@ -244,8 +244,9 @@ class NamedReads(NamedRequests[ValueT]):
     def _is_probe_answer(self, index: int, now: float) -> bool:
         if index != PROBE_INDEX or not self._window.attempts(PROBE):
             return False
-        # After a pause of the link, the answers to earlier probes arrive together. If all of them counted, every name
-        # without an answer would be rejected at once. `may_measure=False` keeps the first from vouching for the others.
+        # After a pause of the link, the answers to earlier probes arrive together. They must not all count, because
+        # every name without an answer would be rejected at once. With `may_measure=False`, the first of them does not
+        # shorten the expected round trip.
         return not self._stale_answers.is_stale(PROBE, self._sent_at[PROBE], now, may_measure=False)
 
     def _count_probe_answer(self) -> None:

@@ -282,8 +282,7 @@ class MultiLinkRoutes:
     def update(self, now: float) -> None:
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
-                # `record_counts` updates `received_at`, which may be too old for the comparison below after a blocked
-                # event loop.
+                # `record_counts` updates `received_at`, which may be too old to compare if the event loop was blocked.
                 if counters := self._counters.get((system_id, link), {}).values():
                     received = sum(counter.received for counter in counters)
                     lost = sum(counter.lost for counter in counters)

@@ -75,7 +75,7 @@ class CommandArbiter:
         # An order without commands, updated with each HEARTBEAT. It records whether a takeover or a failsafe has
         # occurred since the program armed the vehicle. None if another party has armed it.
         self._arming_order: Order | None = None
-        # The newest steering order, and the auxiliary orders in progress.
+        # The last order about flight or mode, and the orders of `auxiliary_order` blocks in progress.
         self._orders_in_progress: list[Order] = []
         self._posted_orders: list[Order] = []  # orders whose `posted_order` block is active
         self._sent_commands: list[SentCommand] = []  # commands whose `sending` block is active
@@ -220,7 +220,7 @@ class CommandArbiter:
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
-        # The vehicle may still change to the modes of the newest steering order.
+        # The vehicle may still change to the modes of the last order about flight or mode.
         modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ending_topics
         action_topics = (ACTION,) if ends_with_actions else ()
@@ -368,7 +368,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        # A takeover ends the newest order. But if this order has no modes, the mode change may be its own effect.
+        # After a takeover, the vehicle executes no order, except one that was posted later (`is_newest` is then False).
+        # A mode change after an order without modes may be the effect of this order.
         was_taken_over = order is not None and bool(order.takeover_reason) and bool(order.modes) and order.is_newest
         # After a takeover, a vehicle that the program has armed stays armed.
         return "arm" in topics if was_taken_over else bool(topics)
@@ -517,7 +518,7 @@ class CommandArbiter:
         was_armed_by_program = is_order_in_progress or is_effect_of_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        # Without topics, no newer order ends this order.
+        # Without `ending_topics`, no newer order ends this order.
         order = self._new_order_expecting_late_modes(modes, ending_topics=())
         self._arming_order = order if was_armed_by_program else None
 

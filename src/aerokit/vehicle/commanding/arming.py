@@ -190,8 +190,7 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
-            # False if another task has given an order meanwhile, above all to disarm. This call has sent one arm
-            # command.
+            # False if another task has given an order meanwhile, above all to disarm. This call sent one arm command.
             is_newest_order = (
                 self._arbiter.latest(STEERING) is order_before
                 and self._arbiter.arm_commands_sent == arm_commands_before + 1

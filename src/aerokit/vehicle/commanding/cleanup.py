@@ -115,7 +115,7 @@ class FlightCleanup:
         self.stop_stream: Callable[[str], None] | None = None
         self._awaited_order: Order | None = None
         self._task = BackgroundTask(session, "aerokit hold", warning_clause="before a hold was confirmed")
-        # A new steering order makes the confirmation of an earlier hold pointless.
+        # A new order about flight or mode makes the confirmation of an earlier hold pointless.
         arbiter.on_steering(self._task.cancel)
 
     async def hold(self) -> None:
@@ -198,7 +198,7 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    # Every new steering order cancels this task, except the one that the task gives itself.
+                    # Every new order about flight or mode cancels this task, except the one that the task gives itself.
                     with self._task.protected():
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)

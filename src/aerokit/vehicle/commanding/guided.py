@@ -235,8 +235,7 @@ class SetpointStream(SteeringStream[SetpointT]):
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
-        # For `_restarts_path`: how often the present set-point is still sent at the stream's rate, and when it was sent
-        # last.
+        # How often the present set-point is still sent at the stream's rate, and when it was sent last.
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)

@@ -268,7 +268,7 @@ class MessagingActions(VehicleBase):
         elif isinstance(message, (CommandInt, CommandLong, SetMode)):
             order = self._arbiter.raw_order(subjects, modes=self._modes_of(message))
             order.was_sent = True
-        else:  # Set-points and mission messages end posted orders, but not the action in progress.
+        else:  # Set-points and mission messages end orders of `Vehicle.posted`, but not the action in progress.
             self._arbiter.supersede(subjects)
 
     def _modes_of(self, message: CommandInt | CommandLong | SetMode) -> tuple[Mode, ...]:

@@ -63,9 +63,9 @@ RESEND_INTERVAL_S = 1.0
 # The vehicle has arrived once it has been within the arrival radius for this many seconds.
 ARRIVED_FOR_S = 0.5
 
-# aerokit sends a direction only for turns between these angles, for which the shorter way might be the wrong one. For
-# other turns, a direction might cause almost a full circle, because ArduPilot measures the turn from its own target
-# heading, not from the reported heading (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
+# A direction is sent only with turns between these angles, whose shorter way might be the wrong one. With other turns,
+# it might cause almost a full circle, because ArduPilot measures the turn from its own target heading, not from the
+# reported heading (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
 MIN_DIRECTED_TURN_DEG, MAX_DIRECTED_TURN_DEG = 170, 350
 
 # The command for a turn with a direction is sent only once, with this many seconds for its acknowledgement.

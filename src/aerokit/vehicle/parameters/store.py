@@ -75,9 +75,9 @@ class ParameterStore:
 
     def set_stale(self, name: str, value: float) -> None:
         """Ignore messages with the old value for ``STALE_VALUE_S`` seconds after a write."""
-        # ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
-        # value. An answer with the old value may therefore arrive after the confirmation of the write. But another
-        # station may also have restored the old value. The parameter is therefore read after each ignored message.
+        # ArduPilot answers PARAM_SET at once, but PARAM_REQUEST_READ up to 0.1 s after it read the value. An answer
+        # with the old value may therefore arrive after the confirmation of the write. Another station may instead have
+        # restored the old value, so the parameter is read after each ignored message.
         self._stale[name] = StaleValue(value, self._transfers.connection.now() + STALE_VALUE_S)
 
     def clear_stale(self, name: str) -> None:

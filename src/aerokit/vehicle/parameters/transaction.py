@@ -119,8 +119,8 @@ class _Block:
 
     def _with_all_bits(self, answer: Parameter) -> Parameter:
         """Return the stored parameter if it equals the answer, which may lack the last bits of a number."""
-        # If they differ, the answer is right: another station has undone our write, and the store has ignored its
-        # message (`set_stale`).
+        # An answer that differs from the stored value is right: another station has undone our write, and the store has
+        # ignored its message (`set_stale`).
         known = self._access.store.get(answer.name)
         return known if known is not None and same_value(float(known.value), float(answer.value)) else answer
 

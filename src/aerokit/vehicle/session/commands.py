@@ -247,9 +247,9 @@ class CommandSender:
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
-                # `send_unconfirmed` has recorded the acks of its transmission as pending, but this call waits for them.
-                # If they have arrived already, this call sends the command again. This is harmless, because only
-                # commands that stop or release something are sent this way.
+                # This call waits for the acks that `send_unconfirmed` has recorded as pending. If they have arrived
+                # already, the command is sent again. This is harmless: only commands that stop or release something are
+                # sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
@@ -275,8 +275,7 @@ class CommandSender:
                 raise
             finally:
                 del self._runs[key], self._order_statuses[key]
-                # Acks arrive in the order of their commands, so those received so far answer the oldest pending
-                # commands.
+                # Acks arrive in the order of their commands. Those received so far answer the oldest pending commands.
                 still_pending = pending_acks[exchange.final_acks :]
                 newly_pending = [self._connection.now()] * exchange.pending_acks
                 self._add_pending_acks(key, [*still_pending, *newly_pending])

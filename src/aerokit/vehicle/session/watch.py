@@ -113,7 +113,7 @@ class VehicleWatch:
         # The connection uses this clock to recognise a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
         # The lowest reading of each clock that has decreased, until `_is_decrease_confirmed` knows whether this is a
-        # reboot.
+        # The lowest reading of each decreased clock, until `_is_decrease_confirmed` decides if it shows a reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
         # ``time_boot_ms`` when the link was lost; None once a later reading has continued it.
         self._lost_clock: _LostClock | None = None
