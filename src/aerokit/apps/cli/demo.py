@@ -154,7 +154,7 @@ class _SquareFlight(SupervisedFlight):
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # If another party has changed the mode, it may also have ordered a hold or a landing.
+        # After a mode change by another party, a mode to hold or to land may be that party's.
         return ("take_off", "setpoint") if self._was_overruled else ("take_off", "setpoint", "hold", "land")
 
     async def _after_failure(self, error: Exception) -> int:

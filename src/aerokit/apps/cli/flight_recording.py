@@ -59,7 +59,7 @@ async def record_to_end(
         f" is silent for {MAX_SILENCE_S:g} s, or Ctrl-C"
     )
 
-    # A crashed vehicle may stay armed, so stillness ends the wait, too. `speedup` is above 1 in a fast simulation.
+    # A crashed vehicle may stay armed, so the wait ends if it lies still. `speedup` is above 1 in a fast simulation.
     stillness = _StillnessNearGround(vehicle, _MAX_STILL_S / speedup)
 
     async def wait() -> int:

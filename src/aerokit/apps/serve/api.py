@@ -507,7 +507,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
 
 
 async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
-    # Before Python 3.12 `asyncio.wait_for`, and before anyio 4.16 `move_on_after`, could lose a cancellation.
+    # Not `asyncio.wait_for` or `move_on_after`: before Python 3.12 and anyio 4.16, they could lose a cancellation.
     waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)
