@@ -101,7 +101,7 @@ class _SubmoduleLoader(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        module.__spec__ = self._own_spec  # The import system has replaced it by the spec of the alias.
+        module.__spec__ = self._own_spec  # importlib has set it to the spec of the alias before this call.
 
 
 FAILED, CANNOT_OPEN = 1, 2
