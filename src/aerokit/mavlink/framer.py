@@ -65,7 +65,7 @@ class _OutOfOrder(NamedTuple):
     identity: int  # sequence number << 16 | component id << 8 | system id
 
 
-# A possible frame: (begin, verdict, number of bytes that must have arrived before it is examined again).
+# Where a frame may begin, the verdict about it, and the size that the data must have for the next examination.
 _Candidate = tuple[int, int, int]
 
 
@@ -171,7 +171,7 @@ class PythonFramer:
                 body = b""
                 end = sequence = key = message_id = checksum = 0
             if not is_valid:
-                # Data that was kept from earlier calls is not examined again: `scan` has the findings for `_search`.
+                # Kept data is not examined twice: `scan` has the results of the earlier call, which `_search` uses.
                 next_frame = None
                 if data[begin] in _MAGICS and (begin or scan is _NEW_SCAN):
                     _, _, next_frame = self._examine(data, begin)
@@ -254,7 +254,7 @@ class PythonFramer:
         examined_to = scan.examined_to
         pending: list[_Candidate] = []
         bad_crcs = list(scan.bad_crcs)
-        # The end 0 makes the loop examine these candidates, and replace the verdict `_NOISE`.
+        # `_NOISE` is a placeholder. The end 0 makes the loop examine every candidate, which replaces both values.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)  # decides about an unknown frame at the end of the data
