@@ -119,7 +119,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # If a poll is due, the next iteration polls. Without timers, it runs the event sources again.
+            # If a poll is due, it happens in the next iteration. Without a timer, the clock cannot jump.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             # No event source is due before the next timer, so the clock jumps to the timer.
