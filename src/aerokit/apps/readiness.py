@@ -73,8 +73,8 @@ def _group_reasons(vehicle: Vehicle, reported: Sequence[str] | None) -> Readines
     sensors = vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     if checks_pass and all(map(_is_about_estimates, against_arming)):
-        # The vehicle's own checks pass, so only its mode decides whether missing estimates prevent arming: ArduCopter
-        # without a position arms in STABILIZE, but not in GUIDED.
+        # The pre-arm checks pass, so only the mode decides whether missing estimates prevent arming: ArduCopter without
+        # a position arms in STABILIZE, but not in GUIDED.
         refusals = tuple(arm_refusals(vehicle, missing)) if reported is None else ()
         all_reasons = dict.fromkeys([*missing, *against_arming])
         return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))

@@ -354,7 +354,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        has_all = self._has_all_values  # Read it before `find`, because the last value may arrive in between.
+        has_all = self._has_all_values  # Read before `find`, because the last value may arrive during `find`.
         resolved = self._values.find(name)
         if resolved is None and waits and not has_all and _is_valid_name(name):
             self._core.run(self._wait_for, name)

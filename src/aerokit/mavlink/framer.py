@@ -233,7 +233,7 @@ class PythonFramer:
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
-                # `frames` has only the wanted messages, so the frame at `position` may be a different one.
+                # `frames` lacks unwanted messages, so the frame at `position` may be a different one.
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
                     continue
                 if ordering == OTHER_SENDER:
@@ -260,7 +260,7 @@ class PythonFramer:
         end_of_data = (size, _NOISE, size)  # decides about an unknown frame at the end of the data
         for position, verdict, end in chain(scan.candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
-                # The unknown frame contains no valid frame. It is accepted if a frame or the end of the data follows.
+                # No valid frame begins inside the unknown frame. It is accepted if a frame or the data's end follows.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._count_skipped(begin, unknown_begin, bad_crcs)
                     self._skip_unknown(data, unknown_begin, unknown_end)
@@ -383,8 +383,8 @@ else:
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
             """Return the start of the next valid frame from ``begin`` on, or None. Add unknown frames to ``frames``."""
-            # `kept` comes from compiled code. It is 0 if no data was kept from earlier calls, 1 if the kept data is the
-            # beginning of one plausible frame, and 2 if `_scan` describes the kept data.
+            # Compiled code sets `kept` to 0 if no data was kept from earlier calls, to 1 if the kept data begins with
+            # one plausible frame, and to 2 if `_scan` describes the kept data.
             scan = _NEW_SCAN
             if kept == 2:
                 scan = self._scan

@@ -213,13 +213,13 @@ class SourceStatistics(SourceFields):
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # keeps the frame out of `current_count`
-        # Two streams of different length: the longer one is taken for the known sender, the other for a second one.
+        # The longer stream is taken for the known sender's, the shorter one for that of a second sender.
         return LATE if is_other_longer else OTHER_SENDER
 
     def _swap_streams(self, sequence: int, now: float, *, current_count: int, other_count: int) -> None:
         """Make the other stream the current one. It continues with the frame that has this sequence number."""
-        # The frames between the two streams counted as lost, but were never sent. The difference is negative if some
-        # of them "arrived late", and were subtracted before.
+        # The numbers between the two streams counted as lost, but were never sent. Some of them may already have been
+        # subtracted, as frames that arrived late, so the difference may be negative.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
         self._other_count = current_count

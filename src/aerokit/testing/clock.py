@@ -165,8 +165,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 if due < earliest_due:
                     earliest_due = due
                     earliest_handle = handle
-            # Stop if the next timer is due earlier or at the same instant. The loop runs the event sources of that
-            # instant together with the timer.
+            # Stop at the next timer. The loop runs the event sources of the same instant together with that timer.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)

@@ -92,7 +92,7 @@ class _StillnessNearGround:
         has_moved = self._still_at is None or position.distance_to(self._still_at) > _MAX_DRIFT_M
         height_m = position.altitude_relative_m
         is_near_ground = height_m is not None and abs(height_m) <= _MAX_HEIGHT_M
-        # If the position is old or has no height, the vehicle may be moving or high.
+        # Only a recent position near the ground can show that the vehicle lies still.
         if is_old or has_moved or not is_near_ground:
             self._still_at = position
             self._still_since = now

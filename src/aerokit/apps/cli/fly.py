@@ -213,7 +213,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_record(command)
     add_vehicle(command)
     add_json(command)
-    # `run_fly` must know whether --connect is given, so it fills in the default address itself.
+    # `run_fly` fills in the default address, because it must know whether --connect is given.
     command.set_defaults(run=run_fly, connect=None)
     # argparse has no public list of a group's options.
     command.set_defaults(simulation_actions=tuple(simulated._group_actions))
@@ -226,7 +226,7 @@ async def run_fly(options: argparse.Namespace) -> int:
         items = getattr(plan, part).to_items()
         if items:
             emit_items(options, part, items, state="in the file")
-    # `_connect_and_fly` appends the flight, so that the flight's state is known here after an interrupt.
+    # `_connect_and_fly` appends the flight, so that this function knows its state after an interrupt.
     flights: list[PlanFlight] = []
     interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):

@@ -198,7 +198,7 @@ class SupervisedFlight(ABC):
             elif action == "hold":
                 await vehicle.hold()
         except CommandRejected as error:
-            # For example, autopilots refuse to return without a position. The vehicle is then held instead.
+            # If the action fails (autopilots refuse to return without a position), the vehicle is told to hold instead.
             if action == "hold" or not self._still_has_control():
                 raise
             self._print(f"{text} failed: {plain_text(error)}; {INTERRUPT_ACTIONS['hold']} instead")

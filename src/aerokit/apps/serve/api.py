@@ -203,7 +203,7 @@ def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
 def _failures(operation: Operation) -> dict[str, Any]:
     if operation.is_open:
         return {}
-    # The statuses 413 and 415 concern request bodies.
+    # Without a request body, the statuses 413 and 415 cannot occur.
     impossible = set() if operation.order or operation.body_type else {"413", "415"}
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {

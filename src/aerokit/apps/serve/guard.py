@@ -224,7 +224,7 @@ class _HttpConnection(H11Protocol):
                 self._anonymous.pop(self, None)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        self._remove_from_anonymous()  # The application itself limits the number of WebSockets.
+        self._remove_from_anonymous()  # WebSockets are not counted here: the application limits their number.
         super().handle_websocket_upgrade(event)
 
     def _start_timer(self) -> None:
