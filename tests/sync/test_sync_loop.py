@@ -288,7 +288,7 @@ def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
         except BaseException as error:
             lost.append((place, error))
     for thread in threading.enumerate():
-        if thread.ident is None:  # CPython goes on to list a thread whose start was interrupted.
+        if thread.ident is None:  # CPython still lists a thread whose start was interrupted.
             threading._limbo.pop(thread, None)  # type: ignore[attr-defined]
         elif thread.name == "aerokit loop":
             thread.join(LIMIT_S)
