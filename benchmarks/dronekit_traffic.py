@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 __all__ = ["ROUNDS", "Numbering", "heartbeat", "packed", "round_number_of", "rounds"]
 
-# The round number wraps after this many.
+# After this many rounds, the round number starts again at 0.
 ROUNDS = 1024
 HEARTBEAT_EVERY = 4
 KINDS = (
@@ -29,7 +29,7 @@ ONLY_IN_VERSION = {1: ("RC_CHANNELS_RAW",), 2: ("ESC_TELEMETRY_1_TO_4",)}
 ARMED_IN_GUIDED = {
     "type": 2, "autopilot": 3, "base_mode": 217, "custom_mode": 4, "system_status": 4, "mavlink_version": 3,
 }  # fmt: skip
-# Degrees in 1e-7.
+# Units of 1e-7 degrees.
 LATITUDE = -353632610
 LONGITUDE = 1491652299
 # Step of the roll angle per round; exact in 32-bit floats.

@@ -72,9 +72,8 @@ def pytest_collection(session: pytest.Session) -> None:
     share is consecutive, because the tests of a folder import the same packages.
     """
     worker, count = os.environ.get("PYTEST_XDIST_WORKER"), os.environ.get("PYTEST_XDIST_WORKER_COUNT")
-    # The first example of hypothesis collects garbage and looks up the referrers of its generators, which takes long
-    # with the objects of all tests, and finds no frozen ones. The first text makes a table of characters, which
-    # hypothesis keeps in a file; one worker makes it for all.
+    # The first example of hypothesis looks up referrers among all objects, so it is run before the tests are imported
+    # and frozen. The first text strategy creates a table of characters in a file, which one worker does for all.
     given(strategies.text() if worker == "gw0" else strategies.none())(lambda _: None)()
     if worker is None or count is None:
         return

@@ -182,7 +182,7 @@ PARAMETERS = [
         "param.pck upload",
         upload_parameters,
         check_writes,
-        # their outcome is read back one by one
+        # After the upload of the file, each parameter is read to see whether the vehicle has accepted it.
         lambda copter, sizes: ideals.file_write(16 * sizes.writes) + ideals.parameter_reads(sizes.writes),
         lambda copter, sizes: blocks(pack_size(copter)) + 2 * sizes.writes,
         before=know_parameters,
@@ -395,7 +395,7 @@ LOG_CASES = [
         "log download as a file",
         read_log("ftp"),
         check_log,
-        # which file it is has to be found out
+        # The directory is read first, to find the name of the log's file.
         lambda copter, sizes: (
             ideals.directory(1) + ideals.file_read(sizes.log_bytes, blocks_per_second=burst_rate(copter))
         ),

@@ -146,7 +146,7 @@ def test_page_shows_silence_with_readable_values(
     with serving(address) as server, opened(browser, server["page"], scheme=scheme) as page:
         page.locator("#server.good", has_text="live").wait_for()
         page.locator(".vehicle", has_text="2 ArduCopter").click()
-        # The page reads it too, but perhaps not before the silence.
+        # The page reads FS_GCS_ENABLE, too, but perhaps only after the vehicle has become silent.
         parameter = f"{server['url'].rstrip('/')}/api/vehicles/2/parameters/FS_GCS_ENABLE"
         assert page.request.get(parameter, headers={"Authorization": f"Bearer {server['token']}"}).ok
         second.faults.silent = True

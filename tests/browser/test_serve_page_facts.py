@@ -323,7 +323,7 @@ def test_start_dialog_names_the_item(browser: Any, copters: tuple[list[Simulated
         wait_done(page, "disarm")
 
 
-# Reasons below buttons that do not fit into them, of all that `obstacle` can return.
+# The reasons (of all that `obstacle` can return) that are too long for the text below a button.
 CUT_OFF = """async () => {
     const source = await (await fetch("/static/readiness.js")).text();
     const body = source.slice(source.indexOf("function obstacle"), source.indexOf("const EKF_POS_HORIZ"));

@@ -114,7 +114,7 @@ def _old(stage: Stage) -> None:
 def _clear_state(name: str) -> Callable[[Stage], None]:
     def clear(stage: Stage) -> None:
         cell = getattr(stage.vehicle.telemetry, name)
-        _ = cell.latest  # Reading the cell decodes what was already received. It would be decoded after `forget`.
+        _ = cell.latest  # Decodes received messages, which a later read would decode after `forget`.
         cell.forget()
 
     return clear

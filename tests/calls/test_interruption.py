@@ -104,7 +104,7 @@ def test_interrupted(name: str, stages: tuple[BlockingStage, Stage], monkeypatch
         was_interrupted = interrupter.interrupted(attempt, at)
         assert was_interrupted or at != AT_ITS_END
         call.after(stage)
-        if name == "Vehicle.reboot":  # Abandoned, it may be executing at this moment.
+        if name == "Vehicle.reboot":  # The vehicle may be rebooting, although the call was interrupted.
             loop.run(anyio.sleep, REBOOTING_S)
         assert (_left(loop, stage, before), at) == (Counter(), at)
         loop.run(stage.answers)

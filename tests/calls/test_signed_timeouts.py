@@ -107,5 +107,5 @@ async def timeout_of(stage: Stage, name: str) -> str:
 
 def sign(stage: Stage, key: SigningKey | None) -> None:
     stage.simulated.signing.key = key
-    stage.simulated.signing.trusts_first_port = key is None  # ArduPilot's first one may be USB
+    stage.simulated.signing.trusts_first_port = key is None  # ArduPilot trusts its first port, which may be USB.
     stage.simulated.signing.load()

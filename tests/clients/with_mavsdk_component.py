@@ -151,7 +151,7 @@ async def use_extended_parameters(param: ParamAsync) -> str:
     from mavsdk.plugins.param import ProtocolVersion
     from mavsdk.plugins.param.param import ParamError
 
-    with contextlib.suppress(ParamError):  # MAVSDK 4.1 selects it and reports UNKNOWN
+    with contextlib.suppress(ParamError):  # MAVSDK 4.1 selects the component, but reports UNKNOWN.
         await param.select_component(1, ProtocolVersion.EXT)
     await param.set_param_custom("WINCH_NAME", "south")
     value = await param.get_param_custom("WINCH_NAME")

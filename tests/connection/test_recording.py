@@ -58,7 +58,7 @@ async def test_pymavlink_reads_every_frame_of_both_directions(tmp_path: Path) ->
             theirs[message.get_srcSystem()] += 1
     log.close()
     assert theirs[255] == ours[255]
-    assert ours[1] - theirs[1] < 60  # AVAILABLE_MODES and CURRENT_MODE are unknown to its dialect
+    assert ours[1] - theirs[1] < 60  # pymavlink's dialect does not have AVAILABLE_MODES and CURRENT_MODE.
 
 
 async def test_late_recording_has_frames_without_subscribers(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ def parameters_are_notified_when_complete(stage: Stage) -> Any:
 
 def keep_three(fc: FlightController) -> None:
     fc.missions.items = [HOME, FIRST, SECOND, THIRD]
-    fc.missions.asks_int = False  # DroneKit supports no other items
+    fc.missions.asks_int = False  # DroneKit does not support MISSION_ITEM_INT.
 
 
 def downloaded(stage: Stage) -> Any:

@@ -355,7 +355,7 @@ def row_31_channels_are_read(stage: Stage) -> Any:
 
 @scenario([(201, -35.1, 149.2, 10.0)], controller={"mode": 4}, is_slow=True)
 def region_of_interest_of_old_firmware(stage: Stage) -> Any:
-    stage.fc.results[195] = 3  # DO_SET_ROI_LOCATION, which came later
+    stage.fc.results[195] = 3  # Old firmware answers UNSUPPORTED to DO_SET_ROI_LOCATION.
     stage.vehicle.gimbal.target_location(stage.dronekit.LocationGlobalRelative(-35.1, 149.2, 10))
     sent = stage.fc.wait_for_command(201)
     return [(sent.command, *(round(p, 4) for p in sent.params[4:]))]

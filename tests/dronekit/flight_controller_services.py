@@ -96,7 +96,7 @@ class ParameterService:
         kind = self.types.get(name, REAL32)
         if self.is_silent or name not in self.values:
             return
-        if self.is_bytewise and frame.param_type != kind:  # PX4 refuses it and reports the old value
+        if self.is_bytewise and frame.param_type != kind:  # PX4 refuses a wrong type and reports the old value.
             self.report(name)
             return
         self.values[name] = self.adjust(name, self._decoded(frame.param_value, kind))

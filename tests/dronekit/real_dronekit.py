@@ -30,7 +30,7 @@ def main(names: list[str]) -> None:
 
 
 def _observed(dronekit: Any, case: Scenario) -> Any:
-    # of MAVLink 2 it makes broadcasts: its behaviour is that under MAVLink 1
+    # DroneKit is observed with MAVLink 1, because with MAVLink 2 it sends commands as broadcasts.
     try:
         return as_json(play(dronekit, case, version=1))
     except BaseException as error:

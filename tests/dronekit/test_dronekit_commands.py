@@ -154,6 +154,7 @@ def test_running_download_is_restarted(empty: Pair) -> None:
     for _ in range(5):
         cmds.download()
     assert cmds.wait_ready(timeout=LIMIT_S)
+    cmds._vehicle._handler.loop.call(lambda: None)  # wait_ready() may return before the loop has notified the listener.
     cmds._vehicle._handler.listener_thread.call(lambda: None)
     assert (len(cmds), notified) == (1, [1])
 

@@ -432,11 +432,11 @@ def test_wait_with_negative_interval_ends(vehicle: dronekit.Vehicle) -> None:
 )
 def test_waits_do_not_use_condition(vehicle: dronekit.Vehicle, wait: Callable[[Any], object]) -> None:
     """Ctrl-C can leave the lock of threading.Condition acquired; the loop's thread or close() then hangs forever."""
-    wait(vehicle)  # This imports what it needs.
+    wait(vehicle)  # The first wait imports modules, which must not be traced.
     used = set[str]()
 
     def trace(frame: FrameType, *_: object) -> None:
-        if frame.f_code.co_name != "current_thread":  # It takes no lock.
+        if frame.f_code.co_name != "current_thread":  # current_thread() takes no lock.
             used.add(frame.f_code.co_filename)
 
     before = sys.gettrace()

@@ -81,7 +81,7 @@ def test_mission_params_5_and_6_that_are_no_positions(empty: Pair) -> None:
     controller, cmds = empty
     cmds.add(waypoint(frame=1, x=1.5, y=-2.00005, param4=math.nan))
     cmds.add(waypoint(command=JUMP, param1=1, param2=3, x=0, y=0, z=0))
-    cmds.add(waypoint(command=RETURN, x=0, y=149.25, z=11))  # ArduPilot cuts it off, and does not use it
+    cmds.add(waypoint(command=RETURN, x=0, y=149.25, z=11))  # ArduPilot drops the fraction of y.
     cmds.upload()
     sent = controller.received("MISSION_ITEM_INT")[-3:]
     assert [(frame.x, frame.y) for frame in sent] == [(15000, -20000), (0, 0), (0, 149)]

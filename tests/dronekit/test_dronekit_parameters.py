@@ -61,7 +61,7 @@ def notified(vehicle: dronekit.Vehicle, fc: FlightController, name: str, value: 
 
     vehicle.add_message_listener("DEBUG", listener)
     wait_for_listeners(vehicle)
-    if "source" in more:  # The flight controller keeps its own value, which a repeated request may read meanwhile.
+    if "source" in more:  # The report is of another sender, so the flight controller keeps its own value.
         more["param_value"] = value
     else:
         fc.parameters.values[name] = value

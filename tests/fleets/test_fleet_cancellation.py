@@ -248,7 +248,7 @@ async def test_policy_does_not_stop_landings_of_vehicles(policy: str) -> None:
         await stage.take_off()
         older = asyncio.create_task(stage.fleet.go_to(north(300)))
         await anyio.sleep(5)
-        await asyncio.gather(*(vehicle.land() for vehicle in stage.fleet.vehicles.values()))  # None was superseded.
+        await asyncio.gather(*(vehicle.land() for vehicle in stage.fleet.vehicles.values()))  # None raises an error.
         assert not (await older).is_complete
         assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: ["LAND"] for name in stage.copters}
 
@@ -274,7 +274,7 @@ async def test_failure_of_released_member_stops_no_others() -> None:
         await stage.take_off()
         flight = asyncio.create_task(stage.fleet.go_to(north(30), stagger_s=3))
         await anyio.sleep(5)
-        for name in ("north/2", "north/3"):  # The first of them is on its way, the other one has not started.
+        for name in ("north/2", "north/3"):  # north/2 is on its way, north/3 has not started.
             stage.fleet.release(name)
         await stage.fleet.vehicles["north/2"].hold()
         result = await flight

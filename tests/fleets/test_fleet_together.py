@@ -276,7 +276,7 @@ async def test_start_missions_after_plan_was_replaced_starts_none(cause: str) ->
         elif cause == "reboot":
             await vehicle.reboot()
             await vehicle.wait_ready()
-        else:  # The plan is still the same.
+        else:  # A download does not change the plan.
             await vehicle.mission.download(method="items")
         (await stage.fleet.arm()).raise_for_errors()
         if cause == "download":
@@ -653,7 +653,7 @@ async def test_landing_between_layers_is_not_overruled_by_next_leg() -> None:
     async with open_stage(2, spacing_m=30, min_distance_m=6.0) as stage:
         await stage.take_off()
         flight = asyncio.create_task(stage.fleet.go_to(swapped(stage)))
-        await anyio.sleep(2)  # One of them is in its layer already.
+        await anyio.sleep(2)  # One of the two vehicles has reached the altitude of its layer.
         low = min(stage.copters, key=lambda name: stage.fleet.vehicles[name].position.value.altitude_relative_m or 0.0)
         landing = asyncio.create_task(stage.fleet[low].land())
         with pytest.raises(OperationRejected, match=f"{low} got a newer order .*; the others stay at"):

@@ -112,7 +112,7 @@ class RandomFlight:
                 before = self.resources()
                 await self.give_calls()
                 await anyio.sleep(SETTLE_S)
-                if self.resources() != before:  # A return that a policy ordered may continue after its action.
+                if self.resources() != before:  # A policy's return may continue after the fleet action that caused it.
                     await anyio.sleep(MAX_RETURN_S)
                 if any(now > then for now, then in zip(self.resources(), before, strict=True)):
                     self.faults.append(f"left behind: {self.resources()}, before {before}")
@@ -309,7 +309,7 @@ class RandomFlight:
     def judge_events(self) -> None:
         for event in self.events:
             if isinstance(event, MemberTakenOver):
-                # PX4 enters a failsafe if its set-points end, and the hold after them was refused.
+                # PX4 enters a failsafe if the set-points end and the hold after the last one was refused.
                 if event.member not in self.pilots and "in a failsafe" not in event.reason:
                     self.faults.append(f"nobody has taken over: {event}")
             elif isinstance(event, PolicyApplied) and any(
@@ -330,7 +330,7 @@ class RandomFlight:
         calls = [call for call in self.calls if name in call.names and call.by in ("fleet", "vehicle", "posted")]
         late: list[tuple[int, float, str]] = []
         if pilot_at is not None:
-            # A call that begins before HEARTBEAT reports the pilot, or is the vehicle's own, takes the vehicle back.
+            # A call of the vehicle, or a fleet call from before HEARTBEAT reports the pilot, takes the vehicle back.
             new = [call for call in calls if call.began_at >= pilot_at]
             if not any(call.by != "fleet" or call.began_at < pilot_at + TAKEOVER_S for call in new):
                 late = [order for order in sent if order[1] > pilot_at + TAKEOVER_S and simulated.is_armed]
@@ -358,7 +358,7 @@ class RandomFlight:
         """Return the orders that undo the newest call, and add a fault if another order has ended this call."""
         newest = calls[-1]
         if any(call.kind == "function" and call.ended_at >= newest.began_at for call in calls[:-1]):
-            return []  # The function of the program gives orders that are newer.
+            return []  # The program's function may give orders after the newest call.
         is_ending = newest.kind in ENDING and (newest.by == "fleet" or newest.kind != "hold")
         error = newest.errors.get(name, "")
         is_protected = is_ending or (newest.by == "fleet" and newest.kind in ("go_to", "take_off"))

@@ -176,7 +176,7 @@ class _Player:
         name = names[number % len(names)]
         kind = parameters.type(name) if isinstance(parameters, SimParameters) else 9
         value = self.script.number()
-        if kind == 6 and not hasattr(self.vehicle, "guided") and math.isfinite(value):  # PX4 expects its bits
+        if kind == 6 and not hasattr(self.vehicle, "guided") and math.isfinite(value):  # PX4 expects int32 bits.
             (value,) = _F32.unpack(struct.pack("<i", max(-(1 << 31), min((1 << 31) - 1, int(value)))))
         try:
             self.send(m.ParamSet(self.vehicle.system_id, 1, name, value, kind))

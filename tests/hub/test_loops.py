@@ -95,7 +95,7 @@ def test_vehicle_that_left_its_port_does_not_circulate() -> None:
     assert reported == ["loop b None"]
 
 
-# Six hubs in a circle: a frame is back within the minute for which a hub remembers it.
+# Around a circle of six hubs, a frame takes less than the minute for which a hub remembers it.
 @pytest.mark.exhaustive
 @given(networks(slowest_s=9.0))
 def test_frames_do_not_circulate_on_any_slow_network(network: Network) -> None:

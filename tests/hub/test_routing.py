@@ -129,7 +129,7 @@ def test_station_with_ids_of_vehicle_gets_no_orders(stage: Stage) -> None:
     assert stage.receive("c", order(1, 0), 255, 190) == {"a"}
     stage.now += ROUTE_TIMEOUT_S + 0.1
     stage.receive("b", STATION)
-    assert stage.receive("c", order(1), 255, 190) == {"a", "b"}  # The ids are those of the station now.
+    assert stage.receive("c", order(1), 255, 190) == {"a", "b"}  # The route to a has timed out.
 
 
 @pytest.mark.parametrize("other", [STATION, CAMERA])
@@ -155,7 +155,7 @@ def test_repeated_frame_is_forwarded_once(stage: Stage) -> None:
     raw = FrameEncoder(1, 1).encode(COPTER)
     assert stage.pass_on("a", raw) == set("bcd")
     assert stage.pass_on("a", raw, is_out_of_order=True) == set()
-    # The counter has come round, and the message is the same: that is another frame.
+    # An equal frame in sequence is a new frame: the sender's sequence numbers have wrapped.
     assert stage.pass_on("a", raw) == set("bcd")
 
 

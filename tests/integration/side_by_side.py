@@ -72,7 +72,7 @@ RAW: tuple[tuple[float, ...], ...] = (
     (C.CAN_FORWARD, 0), (C.DO_INVERTED_FLIGHT, 1),
 )  # fmt: skip
 """Commands with their params; those that are absent are 0."""
-# Frames of ArduPilot; most builds of PX4 ignore the frame, and the simulated one accepts GLOBAL_INT only.
+# Frames for ArduPilot only: most builds of PX4 ignore the frame, and the simulated PX4 accepts only GLOBAL_INT.
 FRAMES = (0, 1, 3, 5, 6, 10, 11, 99)
 WITH_A_PLACE = (
     C.DO_REPOSITION,
@@ -87,8 +87,7 @@ PARAMETERS = {
            ("SIM_GPS1_ENABLE", 0.0), ("SIM_GPS1_ENABLE", 1.0), ("FS_OPTIONS", 0.0), ("RTL_ALT", 1500.0)),
     False: (("MIS_TAKEOFF_ALT", 5.0), ("COM_DISARM_LAND", 3.0), ("RTL_RETURN_ALT", 20.0), ("NO_SUCH_NAME", 1.0)),
 }  # fmt: skip
-# Modes in which a copter with its throttle stick at the lower end falls, or does things that are not
-# simulated; not used in the air.
+# Modes that are not used in the air: with the throttle stick down, the copter falls or does what is not simulated.
 NEEDS_STICKS = frozenset(
     ("STABILIZE", "ACRO", "DRIFT", "SPORT", "FLIP", "THROW", "TURTLE", "ZIGZAG", "SYSTEMID", "AUTOTUNE", "GUIDED_NOGPS")
 )  # fmt: skip

@@ -137,7 +137,7 @@ async def test_failsafe_during_real_outage_keeps_vehicle(choice: Choice) -> None
         assert sent(path, MavCmd.DO_SET_MODE) == 0
         if choice.kind.is_ardupilot:
             assert vehicle.mode_name == "RTL"
-        else:  # It returns to its mode when it receives us again, and aerokit then commands a hold.
+        else:  # When PX4 receives HEARTBEATs again, it returns to its mode, and aerokit commands a hold.
             orders = [
                 message.at for message in path.sent if getattr(message.message, "command", 0) == MavCmd.DO_REPOSITION
             ]
@@ -171,7 +171,7 @@ async def test_fleet_member_taken_by_other_station_is_left_alone(choice: Choice)
     silent = SimulatedCopter(system_id=77, boot_time_s=0.0)
     async with flying(choice) as (vehicle, path), simulated_link(silent) as link:
         connection = vehicle.connection
-        connection.attached.discard(vehicle.system_id)  # Like another program that receives the same vehicle.
+        connection.attached.discard(vehicle.system_id)  # The vehicle looks like one that another program controls.
         async with fleet({"real": connection, "other": link}, count=2) as both:
             path.begin()
             before = vehicle.mode_name

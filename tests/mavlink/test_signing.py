@@ -177,7 +177,7 @@ def test_flipped_bit_is_rejected(bit: int) -> None:
     raw[bit // 8] ^= 1 << bit % 8
     listener = Signing(KEY)
     assert not any(listener.accepts(frame) for frame in Framer().receive(bytes(raw)))
-    # An attacker can compute the checksum, but not the signature.
+    # An attacker who changes the frame can correct the checksum, but not the signature.
     if 1 <= bit // 8 < len(GOLDEN) and raw[0] == 0xFD and raw[1] == GOLDEN[1] and raw[2] == 1:
         assert listener.check(Frame.parse(bytes(raw))) is Refusal.WRONG_SIGNATURE
     assert listener.accepts(framed(GOLDEN))

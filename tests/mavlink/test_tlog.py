@@ -57,7 +57,7 @@ def test_tlog_with_unset_clock() -> None:
 
 
 def test_tlog_zeros_in_truncated_frame_are_not_timestamp() -> None:
-    # 0xFE and 46 look like a MAVLink 1 frame that ends with the file, after eight bytes near zero
+    # The bytes 0xFE and 46 look like a MAVLink 1 frame, and the eight bytes before them like a time near 0.
     raw = FrameEncoder(1, 1).encode(V2Extension(0, 85, 0, 0x2EFE, bytes(range(1, 250))))
     assert read(written(stamped([raw]))[:72]) == []
 

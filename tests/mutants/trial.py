@@ -44,7 +44,7 @@ class Trials:
 
     def __enter__(self) -> Trials:
         shutil.copytree(SOURCE, self._copy)
-        compileall.compile_dir(self._copy, quiet=2)  # Modules that were not imported yet.
+        compileall.compile_dir(self._copy, quiet=2)  # The copy lacks .pyc files of modules that were never imported.
         for name in PRELOADED:
             importlib.import_module(name)
         return self

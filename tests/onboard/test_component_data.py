@@ -52,7 +52,7 @@ async def test_parameters_of_a_companion_are_downloaded_at_once(has_version: boo
     async with device_and_client(191, MavType.ONBOARD_CONTROLLER) as (companion, vehicle):
         companion.parameters.add("WINCH_SPEED", 1.5)
         if not has_version:
-            companion._streams.builders.pop(m.AutopilotVersion.ID)  # REQUEST_MESSAGE is DENIED
+            companion._streams.builders.pop(m.AutopilotVersion.ID)  # The companion answers REQUEST_MESSAGE by DENIED.
         asked: list[m.CommandLong] = []
         detach = companion.connection.attach((m.CommandLong,), asked.append)
         before = anyio.current_time()

@@ -227,7 +227,7 @@ def test_older_rename_table_is_consistent() -> None:
     old, new = ({pair.split(">")[place] for pair in rows} for place in (0, 1))
     for name in (*old, *new, *REPLACED):
         check_name(name)
-    # Names that were renamed twice have one divisor (`_by_name`).
+    # `_by_name` has one divisor for a name that was renamed twice, so the earlier divisor must be 1.
     renamed_twice = {pair.split(">")[0] for _, _, pairs in RENAMED_IN_4_7 for pair in pairs.split()}
     for _, _, divisor, text in RENAMED_BEFORE_4_7:
         assert divisor == 1 or not {pair.split(">")[1] for pair in text.split()} & renamed_twice

@@ -57,7 +57,7 @@ def test_confirmed_upload_is_stored(
     new, vehicle = items(number), model(OLD)
     exchange = upload(new, window=window)
     result = run(exchange, vehicle, Radio(seed, loss, doubling, jitter_s=jitter_s))
-    if result.error is not None:  # With 30 % loss three attempts may all be lost, as in the explicit example.
+    if result.error is not None:  # With 30 % loss, all three attempts may be lost, as in the @example.
         assert loss == 0.3
         assert isinstance(result.error, MissionTimeout)
     elif exchange.result().is_confirmed:

@@ -137,7 +137,7 @@ def test_home_before_origin_is_accepted_by_some_kinds(kind: str, result: int) ->
     assert client.command(MavCmd.DO_SET_HOME, 0, 0, 0, 0, 47.4, 8.5, 500) == result
     client.run(0.2)
     homes = [(home.latitude, home.longitude, home.altitude) for home in client.all(m.HomePosition)]
-    expected = [pytest.approx((474_000_000, 85_000_000, 500_000), abs=20)]  # COMMAND_LONG has floats
+    expected = [pytest.approx((474_000_000, 85_000_000, 500_000), abs=20)]  # COMMAND_LONG has 32-bit floats.
     assert homes == (expected if result == ACCEPTED else [])
     texts = [text for text in client.texts if text.startswith("Set HOME to 47.4000")]
     assert bool(texts) == (kind == "rover")

@@ -298,7 +298,7 @@ def test_condition_yaw_direction_can_turn_long_way() -> None:
 def test_condition_yaw_rate_applies_until_the_heading(direction: int) -> None:
     copter, client = flying_copter(heading_deg=0.0)
     client.command(MavCmd.CONDITION_YAW, 120, 20, direction, 0)
-    client.run(3.0 if direction >= 0 else 9.0)  # After 9 s, the shorter way remains of the longer way.
+    client.run(3.0 if direction >= 0 else 9.0)  # After 9 s of turning the long way, less than 180° remain.
     assert abs(math.degrees(copter.motion.yaw_rate)) == pytest.approx(20, abs=0.1)
 
 

@@ -14,7 +14,7 @@ from aerokit.sim import SimulatedCamera, SimulatedGimbal
 from aerokit.sim.kinds import simulated
 
 KINDS = ("copter", "plane", "rover", "sub", "px4", "px4_plane")
-# The vehicle is silent after it.
+# The vehicle is silent after this command.
 LAST = (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,)
 _ENDS = (*LAST, MavCmd.DO_FLIGHTTERMINATION, MavCmd.COMPONENT_ARM_DISARM)
 

@@ -68,7 +68,7 @@ def test_progress_precedes_the_result(kind: str, radio: FaultModel, seed: int, p
     try:
         result = Pair(vehicle, radio, seed).run(exchange).result
     except TimeoutError:
-        assert reported  # The command was in progress and its result was lost; it must not be sent again.
+        assert reported  # A command in progress whose result was lost must not be sent again.
     except CommandRejected as refusal:
         # The command arrived twice, by a retry or a duplicated frame, which cancels PX4's calibration.
         result = refusal.result

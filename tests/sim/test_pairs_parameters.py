@@ -51,7 +51,7 @@ def test_read_value_equals_the_parameter(kind: str, radio: FaultModel, seed: int
     names = [known[pick] for pick in picks]
     exchange = ParameterReads(1, 1, [*names, "NOT_THERE"], bytewise=kind == "px4", probe=True, idle_timeout_s=60)
     answers = Pair(vehicle, radio, seed).run(exchange)
-    assert isinstance(answers.pop("NOT_THERE"), ParameterRejected | ParameterTimeout)  # Neither answers.
+    assert isinstance(answers.pop("NOT_THERE"), ParameterRejected | ParameterTimeout)  # Autopilots do not answer.
     assert {name: answer.value for name, answer in answers.items() if isinstance(answer, Parameter)} == (
         pytest.approx({name: vehicle.parameters[name] for name in names}, rel=1e-6)
     )

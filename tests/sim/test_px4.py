@@ -467,7 +467,7 @@ def test_any_command_is_answered(command: int, numbers: tuple[float, ...], flyin
     client.command(command, *numbers)
     client.run(15.0)
     finals = [ack for ack in client.all(m.CommandAck) if ack.result != MavResult.IN_PROGRESS]
-    at_most = 2 if command == MavCmd.DO_SET_MODE else 1  # A module that does not run here does not answer.
+    at_most = 2 if command == MavCmd.DO_SET_MODE else 1  # A command for a module that does not run is not answered.
     assert at_most - 1 <= len(finals) <= at_most
     assert client.framer.statistics.bad_crcs == 0
 

@@ -190,7 +190,7 @@ def test_ardupilot_denies_others_during_an_upload() -> None:
     assert other.last(m.MissionAck).type == R.DENIED
     other.send(m.MissionCount(1, 1, 2, RALLY_TYPE))
     assert (other.last(m.MissionRequest).seq, other.last(m.MissionRequest).mission_type) == (0, RALLY_TYPE)
-    client.send(m.MissionCount(1, 1, 3, 0))  # The uploader may restart.
+    client.send(m.MissionCount(1, 1, 3, 0))  # The client of the running upload may start it again.
     assert client.last(m.MissionRequest).target_component == 190
 
 
@@ -587,7 +587,7 @@ def test_px4_handles_random_messages_without_open_transfers(
 ) -> None:
     px4, client = px4_and_client()
     hold(px4, client, talk)
-    client.send(m.MissionRequestList(1, 1, 0))  # The time-out also ends a block.
+    client.send(m.MissionRequestList(1, 1, 0))  # This transfer ends by its time-out in the next 6 s.
     client.run(6.0)
     assert not is_open(px4)
     assert upload(client, [item(RETURN, 2)]) == R.ACCEPTED

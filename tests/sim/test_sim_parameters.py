@@ -305,7 +305,7 @@ def test_px4_stores_every_bit(value: int) -> None:
     payload[:4] = struct.pack("<i", value)
     message = m.ParamSet.decode(bytes(payload))
     frame = client._encoder.encode(message)
-    if struct.pack("<f", message.param_value) == struct.pack("<i", value):  # As many bits as a float has here.
+    if struct.pack("<f", message.param_value) == struct.pack("<i", value):  # A Python float has kept the bits.
         px4.receive(frame, client.now)
         assert px4.parameters["COM_RC_IN_MODE"] == value
 

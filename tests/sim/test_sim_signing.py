@@ -137,7 +137,7 @@ def test_old_frame_is_refused_on_every_port() -> None:
     for station in (radio, third):
         station.receive(raw)
         assert copter.parameters["RTL_ALT"] == 1500.0
-    usb.receive(raw)  # That port accepts unsigned frames.
+    usb.receive(raw)  # The USB port accepts unsigned frames.
     assert copter.parameters["RTL_ALT"] == 1234.0
 
 
@@ -182,7 +182,7 @@ def test_gps_time_advances_the_time_stamps() -> None:
     _, usb, _ = copter_on_two_ports()
     usb.setup(KEY.secret, 1)
     usb.run(1.0)
-    assert usb.stamps()[0] == 1 + ONE_MINUTE  # The clock was received before.
+    assert usb.stamps()[0] == 1 + ONE_MINUTE  # GPS time was received before the key.
     copter = SimulatedCopter(boot_time_s=10.0, unix_time_at_boot=1_800_000_000.0)
     station = Station(copter, copter.channels[0])
     copter.step(1.0)

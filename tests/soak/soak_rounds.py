@@ -96,7 +96,7 @@ async def _silence_and_reboot(number: int) -> None:
             simulated.faults.silent = True
             await asyncio.sleep(0.2)
             simulated.faults.silent = False
-            if number % 2 == 0:  # PX4 in simulation denies it
+            if number % 2 == 0:  # Odd numbers are PX4, which denies a reboot in simulation.
                 await vehicle.reboot()
             await vehicle.wait_ready()
 

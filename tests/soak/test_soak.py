@@ -12,8 +12,7 @@ from soak_rounds import ProcessObjects, count_objects, fly_round
 MINUTES = float(os.environ.get("AEROKIT_SOAK_MINUTES", "0"))
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(120 + 120 * MINUTES)]
 WARM, ROUNDS = 2, 4
-# The interpreter's memory varies, and pytest keeps log records in a short run; one more object per round is a
-# leak.
+# In a short run, the interpreter's memory varies, and pytest keeps log records. One more object per round is a leak.
 OBJECTS, OBJECTS_A_ROUND, KB_A_ROUND = 300, 0.3, 4
 
 

@@ -75,5 +75,5 @@ def test_corrections_reach_vehicle() -> None:
     with served([copter]) as address, aerokit.sync.connect(address) as vehicle:
         vehicle.rtk.send(message)
         assert vehicle.rtk.corrections.value.message_number == 1005
-        list(vehicle.calibrate.barometer())  # Commands arrive after the corrections.
+        list(vehicle.calibrate.barometer())  # The answer shows that the earlier corrections have arrived.
         assert copter.corrections.messages == [message]

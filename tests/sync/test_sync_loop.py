@@ -271,7 +271,7 @@ def test_clean_up_completes_wherever_ctrl_c_arrives(method: str, flags: str) -> 
 def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
     """Interrupt at every line that the main thread runs in aerokit and threading, but not in contextlib and pytest."""
     ours = ("loop_thread.py", "thread_future.py", "threading.py")
-    # CPython would keep an AttributeError that Condition.__init__ handles as the context of all later exceptions.
+    # Interrupted at these lines of Condition.__init__, CPython keeps the AttributeError as context of later exceptions.
     handled = ("except AttributeError:", "pass")
     places = sorted(
         place
@@ -288,7 +288,7 @@ def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
         except BaseException as error:
             lost.append((place, error))
     for thread in threading.enumerate():
-        if thread.ident is None:  # CPython goes on to list a thread whose start was interrupted.
+        if thread.ident is None:  # CPython still lists a thread whose start was interrupted.
             threading._limbo.pop(thread, None)  # type: ignore[attr-defined]
         elif thread.name == "aerokit loop":
             thread.join(LIMIT_S)

@@ -104,7 +104,7 @@ def test_deadlock_error_names_the_waiting_task(monkeypatch: pytest.MonkeyPatch) 
     async def wait_forever() -> None:
         await asyncio.Event().wait()
 
-    # An earlier test may have left a thread of another package.
+    # Threads that another package has left after an earlier test must not count.
     monkeypatch.setattr(threading, "active_count", lambda: 1)
     with pytest.raises(DeadlockError, match="nothing left to wait for") as caught:
         run_virtual(wait_forever())

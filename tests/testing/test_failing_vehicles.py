@@ -91,7 +91,7 @@ def test_vehicle_error_is_raised_by_the_flight(cause: Callable[[Flight], Awaitab
                 await cause(flight)
         assert flight.simulated.now < 6
         assert flight.track.end.time_s == pytest.approx(flight.simulated.now, abs=0.11)
-        await asyncio.sleep(1)  # The cancellation was undone.
+        await asyncio.sleep(1)  # This would raise if the task were still cancelled.
 
     run_virtual(main())
 
@@ -210,7 +210,7 @@ def test_failure_report_survives_vehicle_error() -> None:
     reports = []
 
     async def fly(fleet: SimulatedFleet) -> None:
-        fleet[0].simulated.call_at(fleet[0].simulated.now, raise_error)  # Before the next turn of the loop.
+        fleet[0].simulated.call_at(fleet[0].simulated.now, raise_error)  # It runs before the loop's next iteration.
         reports.append(failure_report([fleet], "a test", None))
 
     with pytest.raises(VehicleError):

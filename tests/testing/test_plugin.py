@@ -40,7 +40,7 @@ def test_plain(flight):
 
 def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunResult:
     pytester.makepyfile(source)
-    plugin = ("-p", "no:aerokit", "-p", "aerokit.testing.plugin")  # Also if the plugin is not installed.
+    plugin = ("-p", "no:aerokit", "-p", "aerokit.testing.plugin")  # Loads the plugin even if aerokit is not installed.
     asyncio = () if "pytest_asyncio" in arguments else ("-p", "no:asyncio")
     return pytester.runpytest_inprocess(
         *plugin,

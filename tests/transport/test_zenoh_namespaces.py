@@ -138,7 +138,7 @@ def test_unplugged_cable(machines: tuple[str, str]) -> None:
         assert client.ask("until dropped") == "done"  # for two seconds it is written into the void
         ip("-n", one, "link", "set", "cable", "up")
         arrived_before = arrived
-        while arrived == arrived_before or late == late_before:  # TCP had kept them, and brings them
+        while arrived == arrived_before or late == late_before:  # TCP delivers what it has kept.
             assert client.ask("until sent") == "done"  # a beacon has come
             sent += 1
             time.sleep(0.05)

@@ -73,13 +73,13 @@ def _group_reasons(vehicle: Vehicle, reported: Sequence[str] | None) -> Readines
     sensors = vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
     if checks_pass and all(map(_is_about_estimates, against_arming)):
-        # The vehicle's own checks pass, so only its mode decides whether missing estimates prevent arming: ArduCopter
-        # without a position arms in STABILIZE, but not in GUIDED.
+        # The pre-arm checks pass, so only the mode decides whether missing estimates prevent arming: ArduCopter without
+        # a position arms in STABILIZE, but not in GUIDED.
         refusals = tuple(arm_refusals(vehicle, missing)) if reported is None else ()
         all_reasons = dict.fromkeys([*missing, *against_arming])
         return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))
     is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against_arming)
-    # `against_arming` may contain a status text, such as "PreArm: …", whose reason is also in `missing`.
+    # No reason is listed twice: "PreArm: X" in `against_arming` is the same reason as "X" in `missing`.
     without_prefix = {vehicle.autopilot.arming_reason(text) for text in against_arming}
     against_flight = tuple(text for text in missing if text not in against_arming and text not in without_prefix)
     return Readiness(against_arming, against_flight, is_known)
@@ -96,7 +96,7 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     needed = []
     for text in missing:
         is_missing_position = text.startswith(("the estimator has no ", "no GPS receiver has "))
-        # A report that was not received does not count, because the vehicle may have the estimate.
+        # If only the report of an estimate is missing, the vehicle itself may have the estimate and arm.
         is_missing_report = text.startswith(("estimator (", "position (", "home (")) and text.endswith(" not received)")
         if (needs_position or not is_missing_position) and not is_missing_report:
             needed.append(text)
@@ -120,8 +120,7 @@ def arm_refusals(vehicle: Vehicle, missing: list[str]) -> list[str]:
     mode = vehicle.mode.latest
     current_mode = None if mode is None else mode.name
     arms_in = current_mode if unarmable is None else unarmable["arms_in"]
-    # In modes that need no position, ArduPilot arms without most of these conditions. For other firmware, the modes
-    # that need a position are unknown.
+    # An empty `modes_without_position` means that it is unknown which modes of this autopilot need a position.
     needs_position = bool(autopilot.modes_without_position) and arms_in not in autopilot.modes_without_position
     estimator = vehicle.estimator.latest
     if arms_in is not None and needs_position and estimator is not None and estimator.missing:

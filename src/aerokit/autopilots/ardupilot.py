@@ -137,9 +137,9 @@ BLIMP = ModeTable(
         2: "VELOCITY",
         3: "LOITER",
         4: "RTL",
-        5: "AUTO",
+        5: "AUTO",  # AUTO and HOLD are in pymavlink, but not in Blimp/mode.h.
         6: "HOLD",
-    }  # The modes 5 and 6 exist only in pymavlink.
+    }
 )
 
 TRACKER = ModeTable({0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUIDED", 10: "AUTO", 16: "INITIALISING"})
@@ -251,7 +251,7 @@ class ArduCopter(ArduPilot):
     condition_yaw = True
     lands_after_return = True
     auto_disarm_parameter: ClassVar[str | None] = "DISARM_DELAY"
-    # There is no DO_ORBIT, and CIRCLE follows the throttle stick (mode_circle.cpp).
+    # ArduCopter does not have MAV_CMD_DO_ORBIT, and its mode CIRCLE follows the throttle stick (mode_circle.cpp).
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = "setpoints"
     arming_mode: ClassVar[str | None] = "GUIDED"
     unarmable_modes: frozenset[str] = frozenset(

@@ -120,8 +120,8 @@ class Px4(Autopilot):
     reposition_purpose: Purpose = "hold"
     holds_after_mission = True
     mission_end_text: str | None = "Mission finished"  # mission_base.cpp
-    # PX4 also sends this text if a finished mission is started again, unless an item was selected (mission_base.cpp,
-    # update_mission).
+    # PX4 sends this text if it has no mission, and if a finished mission is started without selecting an item
+    # (mission_base.cpp, update_mission).
     no_mission_text: str | None = "No valid mission available"
     prearm_depends_on_mode = True
     # PX4 answers by a status text for each failing check (Commander.cpp; measured with 1.17 in simulation).
@@ -160,7 +160,7 @@ class Px4(Autopilot):
     mission_storage = "px4"
     mission_upload_window = 6
     reports_mission_checksum = True
-    overwrites_plans_in_place: frozenset[int] = frozenset()  # New items go into a second storage area.
+    overwrites_plans_in_place: frozenset[int] = frozenset()  # PX4 writes a new plan into a second storage area.
     repeats_item_reached = True
     unsupported_messages: frozenset[str] = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
@@ -248,7 +248,7 @@ class Px4(Autopilot):
         return (*super().failing_sensors(present, enabled, health), *(f"{name} (missing)" for name in missing))
 
     def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool:
-        # If the vehicle can be armed in its current mode, PX4 sets this bit, but only in ``health``.
+        # PX4 sets this bit only in ``health``, and only if the vehicle can be armed in its current mode.
         return bool(health & PREARM_CHECK)
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:

@@ -262,8 +262,8 @@ class VehicleAttributes(VehicleCore):
         self._dk.ready.mark("last_heartbeat")
 
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
-        has_rangefinder_message = self._dk_rangefinder.message is not None  # RANGEFINDER takes precedence.
-        if message.orientation == FACING_DOWN and not has_rangefinder_message:
+        uses_rangefinder_message = self._dk_rangefinder.message is not None
+        if message.orientation == FACING_DOWN and not uses_rangefinder_message:
             self._dk_distance_down = message.current_distance / 100.0
             self._dk.listeners.notify_attribute("rangefinder")
 

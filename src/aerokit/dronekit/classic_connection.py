@@ -51,7 +51,7 @@ class ClassicConnection:
         self.target_system = target_system
         """System id of the vehicle, 0 until it is found."""
         self.listener_thread: ListenerThread = ListenerThread()
-        self.listener_thread.on_called = loop.activity.feed  # Our HEARTBEAT stops when the program shows no activity.
+        self.listener_thread.on_called = loop.activity.feed  # Without activity, the HEARTBEAT of aerokit stops.
         self.loop = loop
         self._context = context  # the context manager of `open_connection`; close() exits it
         self.connection: Connection = context.value
@@ -255,7 +255,7 @@ class BackgroundCalls:
 
 
 def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
-    # Earlier calls have created tasks. The next iteration of the loop starts these tasks before it calls the function.
+    # `call_soon` calls the function after the first steps of all tasks that earlier calls have created.
     asyncio.get_running_loop().call_soon(function, *args)
 
 

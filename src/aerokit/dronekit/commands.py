@@ -38,8 +38,8 @@ PARAM_FIELDS = ("param1", "param2", "param3", "param4")
 # Fields to compare with the vehicle's mission.
 CONTENT_FIELDS = ("frame", "command", "autocontinue", *PARAM_FIELDS, "x", "y", "z")
 AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
-# A first waypoint this close to home is taken for the home row of a waypoint file. 1e-4 degrees are about ten metres.
-HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0
+# The first row of a waypoint file is home. A first waypoint this close to home is taken for that row.
+HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0  # 1e-4 degrees are about ten metres
 
 
 if TYPE_CHECKING:  # The class of pymavlink has no useful annotations.

@@ -100,7 +100,7 @@ class LatestMessage(Generic[MessageT]):
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
         self._notified_names: set[str] = set()  # attributes whose listeners the handlers notify
-        # True if a handler does more than notify listeners, so that no message may be skipped for lack of listeners.
+        # Without listeners, messages are not decoded. True if a handler needs them nevertheless.
         self._needs_every_message = False
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
@@ -147,7 +147,7 @@ class LatestMessage(Generic[MessageT]):
     def _must_decode(self) -> bool:
         """Return True if a handler needs the message now."""
         names = self._notified_names
-        have_all_values = names <= self._ready_names  # An attribute's first value also ends a wait_ready().
+        have_all_values = names <= self._ready_names  # wait_ready() needs the first value even without listeners.
         if self._needs_every_message or not have_all_values:
             return True
         for listeners in self._listeners:
@@ -374,7 +374,7 @@ class VehicleCore(HasObservers):
                 return False
             self._dk.check_may_wait()
             if (failure := ready.failure_of(missing)) is not None:
-                if raise_exception:  # Several threads may raise it, so each raises a copy.
+                if raise_exception:  # Each thread raises a copy, because a shared exception would mix the tracebacks.
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
             for name in ready.fetchers.keys() & missing:

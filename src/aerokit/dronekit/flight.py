@@ -131,15 +131,15 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_arm_or_disarm(self, armed: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
         had_opposite_order = self._dk_has_pending_order(armed=not armed)
-        if self._dk_reports_armed(armed) and not had_opposite_order:  # There is nothing to do.
+        if self._dk_reports_armed(armed) and not had_opposite_order:
             self._dk.check_link()
             return
         order = self._dk_order_armed(armed)
         if wait:
 
             def is_done() -> bool:
-                # HEARTBEAT may report the wanted state only because the opposite order has had no effect yet. Then wait
-                # until `order` is done.
+                # As long as an earlier opposite order has no effect, HEARTBEAT reports the wanted state. It proves
+                # nothing until `order` is done.
                 return self._dk_reports_armed(armed) and (order.done() or not had_opposite_order)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
@@ -161,7 +161,7 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
         takes_altitude_amsl = aio.autopilot.repositions_amsl
-        if not takes_altitude_amsl:  # ArduPilot, which also stays in its mode during the take-off, so none is given.
+        if not takes_altitude_amsl:  # ArduPilot takes off in its present mode, so `()` selects no mode.
             params = (0, 0, 0, 0, 0, 0, altitude)
             return self._dk.order("takeoff", flight_orders.take_off, aio, (), MavCmd.NAV_TAKEOFF, *params)
         plan = aio.autopilot.take_off(altitude, self._dk_home_altitude(), is_vtol=aio.is_vtol)
@@ -208,7 +208,7 @@ class FlightMethods(VehicleAttributes):
         if modes and self._flightmode not in map(str, modes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
-            return  # Do not send the speeds: they would change the flight in the present mode.
+            return  # The speeds are not sent, because they would change the flight in the present mode.
         self._dk.order("goto", flight_orders.go_to, aio, target)
         if airspeed is not None:
             self.airspeed = airspeed

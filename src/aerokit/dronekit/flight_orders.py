@@ -256,7 +256,7 @@ class CurrentCommand:
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))  # once, as in DroneKit
         current, sent_at = aio.telemetry.mission_current, aio.connection.now()
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
-            # A report of this number from before the message does not confirm it.
+            # A report from before MISSION_SET_CURRENT does not confirm the command, even if it has this number.
             await current.wait_until(lambda progress: progress.current == seq and current.updated_at > sent_at)
             return
         # MISSION_SET_CURRENT was not confirmed in time, so send a command instead, which the vehicle acknowledges.

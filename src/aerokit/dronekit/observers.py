@@ -93,7 +93,7 @@ class Listeners:
             self.deliver(name, value)
         elif waits:
             self._thread.call(self.deliver, name, value)
-        elif cache:  # A change is reported only once, so it must not be dropped.
+        elif cache:  # With `cache`, each value is reported only once, so no report may be dropped.
             self._thread.post(self.deliver, name, value)
         else:
             self._thread.post_or_drop(self.deliver, name, value)

@@ -82,7 +82,7 @@ class ParameterDownload:
             await self._request(name)
             return
         async with anyio.create_task_group() as group:
-            # Request the parameter during the download of all parameters, and wait until either of them succeeds.
+            # Request the parameter besides the download of all parameters. The first success ends the wait.
 
             async def request() -> None:
                 if await self._request(name):
@@ -136,7 +136,7 @@ async def _download(
         return
     except AerokitError as error:
         on_failure(error)
-        # A waiting program starts the next download as soon as this one ends, so a pause limits the attempts.
+        # `wait_for` starts a new download as soon as this one ends, so this pause limits the failing attempts.
         await anyio.sleep(RETRY_DELAY_S)
     finally:
         on_ended()
@@ -354,7 +354,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        has_all = self._has_all_values  # Read it before `find`, because the last value may arrive in between.
+        has_all = self._has_all_values  # Read before `find`, because the last value may arrive during `find`.
         resolved = self._values.find(name)
         if resolved is None and waits and not has_all and _is_valid_name(name):
             self._core.run(self._wait_for, name)
@@ -386,7 +386,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         self._store(message.param_id)
 
     def _on_changed(self, event: ParameterChanged) -> None:
-        # The event also reports the values of downloads that the program started with vehicle.aio.
+        # The event reports the values of all downloads, even of those that the program started with vehicle.aio.
         if event.system_id == self._core.target_system:
             self._store(event.name)
 

@@ -101,7 +101,7 @@ class _SubmoduleLoader(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        module.__spec__ = self._own_spec  # The import system has replaced it by the spec of the alias.
+        module.__spec__ = self._own_spec  # importlib has set it to the spec of the alias before this call.
 
 
 FAILED, CANNOT_OPEN = 1, 2
@@ -315,7 +315,7 @@ def _print_program_traceback(kind: type[BaseException], error: BaseException, tr
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
     entry = traceback
-    # The first frames are our own, up to the function that runs the program. Frames of runpy may follow.
+    # Skip the frames of aerokit, up to the function that runs the program. Frames of runpy may follow.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
         entry = entry.tb_next
     if entry is None:  # The error did not happen in the program, so all frames are of interest.

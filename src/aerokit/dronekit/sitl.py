@@ -84,7 +84,7 @@ class ServedVehicle:
         try:
             self._loop.run_until_complete(self._serve())
         except Exception as error:
-            if self._startup_ended.is_set():  # During the startup, `__init__` raises the error.
+            if self._startup_ended.is_set():  # An error before the end of the startup is raised by `__init__`.
                 errprinter(f"the simulated vehicle failed: {error!r}")
             self._error = error
         finally:

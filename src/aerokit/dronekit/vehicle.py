@@ -293,7 +293,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         names, ready = set[str](FIRST_VALUES), self._dk.ready
         now = time.monotonic()
         deadline = now + FIRST_VALUES_TIMEOUT_S
-        next_value_deadline = deadline  # The shorter time-out begins with the first value.
+        next_value_deadline = deadline  # NEXT_VALUE_TIMEOUT_S applies after the first value.
         missing_before = names
         while (missing := names - ready.names) and now < min(deadline, next_value_deadline):
             if len(missing) < len(missing_before):  # Another value has arrived.

@@ -65,7 +65,7 @@ class _OutOfOrder(NamedTuple):
     identity: int  # sequence number << 16 | component id << 8 | system id
 
 
-# A possible frame: (begin, verdict, number of bytes that must have arrived before it is examined again).
+# Where a frame may begin, the verdict about it, and the size that the data must have for the next examination.
 _Candidate = tuple[int, int, int]
 
 
@@ -171,7 +171,7 @@ class PythonFramer:
                 body = b""
                 end = sequence = key = message_id = checksum = 0
             if not is_valid:
-                # Data that was kept from earlier calls is not examined again: `scan` has the findings for `_search`.
+                # Kept data is not examined twice: `scan` has the results of the earlier call, which `_search` uses.
                 next_frame = None
                 if data[begin] in _MAGICS and (begin or scan is _NEW_SCAN):
                     _, _, next_frame = self._examine(data, begin)
@@ -233,7 +233,7 @@ class PythonFramer:
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
-                # `frames` has only the wanted messages, so the frame at `position` may be a different one.
+                # `frames` lacks unwanted messages, so the frame at `position` may be a different one.
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
                     continue
                 if ordering == OTHER_SENDER:
@@ -254,13 +254,13 @@ class PythonFramer:
         examined_to = scan.examined_to
         pending: list[_Candidate] = []
         bad_crcs = list(scan.bad_crcs)
-        # The end 0 makes the loop examine these candidates, and replace the verdict `_NOISE`.
+        # `_NOISE` is a placeholder. The end 0 makes the loop examine every candidate, which replaces both values.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)  # decides about an unknown frame at the end of the data
         for position, verdict, end in chain(scan.candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
-                # The unknown frame contains no valid frame. It is accepted if a frame or the end of the data follows.
+                # No valid frame begins inside the unknown frame. It is accepted if a frame or the data's end follows.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._count_skipped(begin, unknown_begin, bad_crcs)
                     self._skip_unknown(data, unknown_begin, unknown_end)
@@ -383,8 +383,8 @@ else:
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
             """Return the start of the next valid frame from ``begin`` on, or None. Add unknown frames to ``frames``."""
-            # `kept` comes from compiled code. It is 0 if no data was kept from earlier calls, 1 if the kept data is the
-            # beginning of one plausible frame, and 2 if `_scan` describes the kept data.
+            # Compiled code sets `kept` to 0 if no data was kept from earlier calls, to 1 if the kept data begins with
+            # one plausible frame, and to 2 if `_scan` describes the kept data.
             scan = _NEW_SCAN
             if kept == 2:
                 scan = self._scan

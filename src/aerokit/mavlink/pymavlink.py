@@ -278,7 +278,7 @@ class _Layout:
         zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
         # The names of the attributes, in wire order. A text field is listed by the attribute with its raw bytes.
         self.names: list[str] = []
-        # For each field, the position of its first unpacked value, and their number. Empty if no field is an array.
+        # For each field, the index of its first unpacked value, and the number of its values. Empty without arrays.
         self.arrays: list[tuple[int, int]] = []
         self.texts: list[tuple[str, str]] = []  # for each text field, its name and the name of its raw bytes
         position = 0

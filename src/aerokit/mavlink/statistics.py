@@ -11,12 +11,12 @@ _SILENCE_S = 10.0
 _MAX_UNKNOWN_IDS = 64
 _HALF = 128  # Sequence numbers wrap at 256. A number that is this far ahead, or farther, counts as behind.
 _WINDOW = (1 << _HALF) - 1  # mask of the bits in `_missing`
-_MAX_STEP = 4  # Sequence numbers of consecutive frames of one stream rarely differ by more.
-_MAX_GAP = 16  # A frame after a larger gap may belong to another stream.
-_MIN_ALTERNATIONS = 10  # Two streams that alternate this often have different senders.
-_EXPIRY_S = 5.0  # A second stream is forgotten when it has been silent for this time.
-_STREAM_TIMEOUT_S = 1.5  # A stream has ended after this silence, because no autopilot is silent for so long.
-_MIN_RETURNS = 3  # If the other stream is longer, it becomes the current one after this many further frames.
+_MAX_STEP = 4  # Sequence numbers of consecutive frames of one sender rarely differ by more.
+_MAX_GAP = 16  # A frame after a larger gap may come from a second sender with the same ids.
+_MIN_ALTERNATIONS = 10  # If two series of sequence numbers alternate this often, they are from two senders.
+_EXPIRY_S = 5.0  # A second sender with the same ids is forgotten after this silence.
+_STREAM_TIMEOUT_S = 1.5  # Autopilots send HEARTBEAT every second, so a sender that is silent for longer has ended.
+_MIN_RETURNS = 3  # The other stream replaces the current one after this many frames, if it has more frames.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHER_SENDER = range(3)
@@ -68,7 +68,7 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # The property `received` is `expected` minus this, so that a frame in sequence changes only `expected`.
+        # `received` is computed as `expected - _unreceived`. A frame in sequence then changes only `expected`.
         self._unreceived = sequence
         # Missing frames: bit 0 is set if the frame before `_missing_base` is missing, bit 1 for the one before that, …
         self._missing = 0
@@ -127,9 +127,9 @@ class SourceStatistics(SourceFields):
 
     def _on_gap(self, ahead: int, now: float) -> None:
         """Process a frame after ``ahead`` missing frames."""
-        # If a missing frame arrives late, it is subtracted again.
+        # `out_of_order` subtracts each missing frame that arrives late.
         self.lost += ahead
-        if ahead > _MAX_GAP:  # The frame may belong to another stream.
+        if ahead > _MAX_GAP:  # The frame may come from a second sender with the same ids.
             self._begin_stream(now)
             self._skipped_over = ahead
         missing_bits = ((1 << ahead) - 1) << 1  # bit 0 is this frame
@@ -172,7 +172,7 @@ class SourceStatistics(SourceFields):
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
-        # Repeated frames in sequence may come from a second sender, whose frames alternate with those of the first.
+        # If two senders use the same ids, their frames alternate. Those of one sender look like repetitions.
         if follows_last_repetition:
             self._count_alternation(now)
         else:
@@ -195,33 +195,31 @@ class SourceStatistics(SourceFields):
         """Process a frame of the other stream. Return how it is to be treated, as :meth:`out_of_order` does."""
         current_count = self.received - self._stream_start
         is_other_longer = self._other_count > current_count
-        is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
+        has_current_ended = now - self._advanced_at > _STREAM_TIMEOUT_S
         self._count_alternation(now)
         if is_other_longer:
             self._returns += 1
-        # If the current stream has timed out, the other stream replaces it at once. Otherwise, only a longer stream
-        # replaces it, after `_MIN_RETURNS` frames.
-        if is_over or self._returns >= _MIN_RETURNS:
-            # If the other stream is shorter, its frames are counted from 0 again.
+        if has_current_ended or self._returns >= _MIN_RETURNS:
+            # A shorter stream that becomes the current one starts with a count of 0.
             other_count = self._other_count if is_other_longer else 0
             self._swap_streams(sequence, now, current_count=current_count, other_count=other_count)
             return IN_ORDER
         if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
-            # The frame is in the gap between the streams, and was counted as lost.
+            # The frame was counted as lost, because it is in the gap between the sequence numbers of the streams.
             self.lost -= 1
             self._skipped_over -= 1
         self._other_expected = (sequence + 1) & 0xFF
         self._other_count += 1
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
-        self._stream_start += 1  # The frame does not count as one of the current stream.
-        # The shorter stream is assumed to come from a second sender.
+        self._stream_start += 1  # keeps the frame out of `current_count`
+        # The longer stream is taken for the known sender's, the shorter one for that of a second sender.
         return LATE if is_other_longer else OTHER_SENDER
 
     def _swap_streams(self, sequence: int, now: float, *, current_count: int, other_count: int) -> None:
         """Make the other stream the current one. It continues with the frame that has this sequence number."""
-        # The numbers between the two streams were not lost, so they are subtracted. Some of them may have arrived late
-        # and been subtracted before, so the difference may be negative.
+        # The numbers between the two streams counted as lost, but were never sent. Some of them may already have been
+        # subtracted, as frames that arrived late, so the difference may be negative.
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
         self._other_count = current_count

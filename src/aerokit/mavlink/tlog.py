@@ -19,11 +19,11 @@ _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
-# While searching for a record after garbage, ignore times before the year 2000, because zeros in a frame's header look
-# like such times. A record directly after another one may have such a time, because the computer's clock may be wrong.
+# After garbage, a time before the year 2000 does not begin a record, because zeros in a frame's header look like one.
+# Directly after another record, such a time is accepted, because the computer's clock may be wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
-# A quick check: every time with first bytes up to these is before _LAST_TIME.
+# A time whose first two bytes are at most these is before _LAST_TIME. The check of two bytes is quick.
 _MAX_TIME_PREFIX = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]
 
 
@@ -101,7 +101,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
     """Return True if a record probably begins between ``begin`` and ``end``, instead of at ``begin``."""
     for inside in range(begin + 1, end):
         inside_end = _frame_end(data, inside)
-        # A record begins at `inside`, ends after `end`, and is followed by another record.
+        # True if a possible record begins at `inside`, ends after `end`, and is followed by another record.
         if inside_end is not None and inside_end > end and _frame_end(data, inside_end) is not None:
             return True
     return False

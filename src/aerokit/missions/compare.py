@@ -45,7 +45,7 @@ class ItemStorage(Enum):
 # How an autopilot stores the parameters of each command: one letter for each of `FIELDS`, explained in `_stored_as`.
 # Fields without a letter are not stored and are read back as 0, except those of a place.
 _ARDUPILOT_FORMS: dict[int, tuple[str, ...]] = {
-    MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # The first string is for Copter, Rover and Sub, the second for Plane.
+    MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # "u" on Copter, Rover and Sub, "-cc" on Plane
     MavCmd.NAV_LOITER_UNLIM: ("--r",),
     MavCmd.NAV_LOITER_TURNS: ("n-R?",),
     MavCmd.NAV_LOITER_TIME: ("u-g?",),
@@ -103,7 +103,7 @@ _ARDUPILOT_FORMS: dict[int, tuple[str, ...]] = {
     MavCmd.DO_VTOL_TRANSITION: ("b",),
     MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: ("u",),
     MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: ("u",),
-    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: ("f", "u"),  # The second string is for firmware before 4.5.
+    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: ("f", "u"),  # "u" on firmware before 4.5
     MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: ("f", "u"),
     MavCmd.DO_WINCH: ("bbff",),
     MavCmd.NAV_SCRIPT_TIME: ("bbhhss",),

@@ -163,7 +163,7 @@ DEGREE_SCALE = 10_000_000
 
 def xy_scale(command: int, frame: int) -> int:
     """Return the scale of x and y in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1."""
-    # ArduPilot determines the scale by the command, PX4 by the frame. PX4 refuses an item for which the two differ.
+    # ArduPilot chooses the scale by the command, PX4 by the frame. Both agree for every item that PX4 accepts.
     if not has_place(command):
         return 1
     if frame in GLOBAL_FRAMES:

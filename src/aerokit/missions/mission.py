@@ -260,7 +260,7 @@ def _place(item: MissionItem, index: int) -> Position:
         place = Position(item.x / 1e7, item.y / 1e7)
     except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
-    # Only a return point has an altitude. In the frame GLOBAL, 0 means that it is unknown (`_return_item`).
+    # Of all fence items, only a return point has an altitude. In the frame GLOBAL, 0 means "unknown" (`_return_item`).
     has_altitude = item.command == MavCmd.NAV_FENCE_RETURN_POINT and (
         item.z != 0 or canonical_frame(item.frame) != MavFrame.GLOBAL
     )

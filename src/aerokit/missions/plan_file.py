@@ -101,7 +101,7 @@ def format_plan(plan: Plan | Mission) -> str:
         raise InvalidArgument("the plan cannot be written: it was read from a file that is nested too deeply") from None
     except InvalidArgument:
         raise
-    except FileFormatError as error:  # The text from which the plan was read is invalid.
+    except FileFormatError as error:  # `plan.source`, the text of the original file, is invalid.
         raise InvalidArgument(f"the plan cannot be written: {error}") from error
     except ValueError as error:
         raise InvalidArgument("a number of the plan is not finite, and a .plan file cannot store it") from error

@@ -130,12 +130,12 @@ def merged_entries(
         is_jump_target = not _items_with_id(entries[number]) and any(start <= target < end for target in targets)
         return not is_jump_target and _matches(groups[number], items[start:end])
 
-    # Keep the entries before `head_end`, which contain the items before `first_new`.
+    # The file's entries before `head_end` are kept. They contain the plan's items before `first_new`.
     head_end, first_new = 0, 0
     while head_end < len(groups) and may_keep(head_end, first_new):
         first_new += len(groups[head_end])
         head_end += 1
-    # Keep the entries from `tail_start` on, which contain the items from `end_new` on.
+    # The file's entries from `tail_start` on are kept. They contain the plan's items from `end_new` on.
     tail_start, end_new = len(groups), len(items)
     while tail_start > head_end:
         start = end_new - len(groups[tail_start - 1])
@@ -205,7 +205,7 @@ def _jump_ids(entries: Sequence[_Entry]) -> dict[int, int]:
             else:
                 ids_in_surveys.setdefault(jump_id, index)
         first += entry.size
-    # If two items have the same id, an item with an entry of its own is preferred to one inside a survey.
+    # If an item inside a survey has the same id as an item with an entry of its own, the latter is used.
     return ids_in_surveys | ids_of_entries
 
 
@@ -220,7 +220,7 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
         longitude_param.number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:
         param1 = _jump_target(first_param, ids)
-    if math.isnan(z) and has_place(command):  # The file has no altitude in `params`.
+    if math.isnan(z) and has_place(command):  # The file has null instead of the altitude in `params`.
         frame, z = _planned_altitude(value, frame)
     x, y = (scaled_coordinate(number, command, frame) for number in (latitude, longitude))
     return MissionItem(command, frame, param1, param2, param3, param4, x, y, z, value["autoContinue"].boolean())

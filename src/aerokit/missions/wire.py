@@ -156,7 +156,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
-            # In ArduPilot, 0°, 0° means the current position. During the mission, this is the previous destination.
+            # ArduPilot takes 0°, 0° for the current position, which during the mission is the previous destination.
             if current_xy is not None and item.x == item.y == 0:
                 x, y = current_xy
                 item = item.replace(x=x, y=y)

@@ -166,13 +166,13 @@ class CameraDefinition(Snapshot):
         options = self.settings[name].options if name in self.settings else ()
         reasons: list[str] = []
         for setting, selected in self._selected(values):
-            if setting.name == name:  # A setting does not restrict itself.
+            if setting.name == name:  # The value of a setting does not limit its own options.
                 continue
             for restriction in selected.ranges:
                 if restriction.setting != name or not _evaluate(restriction.condition, values):
                     continue
                 allowed = restriction.options
-                if reasons:  # Another restriction applies too, so only the options that both allow remain.
+                if reasons:  # Only options that every restriction allows remain.
                     previous_keys = {setting_key(option.value) for option in options}
                     allowed = tuple(option for option in allowed if setting_key(option.value) in previous_keys)
                 options = allowed

@@ -53,7 +53,7 @@ class ParameterType(IntEnum):
     @property
     def is_integer(self) -> bool:
         """True if values are whole numbers, ``int`` in Python."""
-        return self < 9  # REAL32, whose lookup takes longer than the comparison
+        return self < 9  # 9 is REAL32. Looking up the member would take longer.
 
     @property
     def is_signed(self) -> bool:

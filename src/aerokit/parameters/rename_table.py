@@ -48,7 +48,7 @@ _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 
 def _position_controller(prefix: str) -> tuple[tuple[int, str], ...]:
     """Return the renames of the position controller, each with its divisor."""
-    # The controller changed from north-east-up in centimetres to north-east-down in metres.
+    # ArduPilot's position controller (PSC) changed from north-east-up in centimetres to north-east-down in metres.
     moved = (
         _change_prefix(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _VELOCITY_CONTROLLER),
         _change_prefix(f"{prefix}VELZ_", f"{prefix}D_VEL_", _VELOCITY_CONTROLLER),

@@ -237,8 +237,8 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
             two_way.update(dict.fromkeys(rename.names, rename))
     for since, vehicles, divisor, pairs in rename_table.RENAMED_BEFORE_4_7:
         for old, new in _pairs(pairs):
-            # If the new name was renamed again later, both renames become one with several old names. Its divisor is
-            # that of the later rename, because the earlier one did not change the units.
+            # If `new` was renamed again in a later version, the later rename gets `old` as a further old name. Its
+            # divisor is right for `old`, too, because the earlier rename has not changed the units.
             rename = two_way.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
             if old not in rename.names:
                 rename = rename.replace(other_old=(*rename.other_old, old))

@@ -150,17 +150,17 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
         return repr(self.aio)
 
     def __bool__(self) -> bool:
-        return bool(self.aio)  # The cell raises a TypeError with a hint.
+        return bool(self.aio)  # `aio` raises a TypeError with a hint.
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
             if name.startswith("_"):  # `copy.copy` reads such names before `self.aio` exists.
                 raise AttributeError(name)
-            return getattr(self.aio, name)  # The cell raises an AttributeError with a suggestion.
+            return getattr(self.aio, name)  # `aio` raises an AttributeError with a suggestion.
 
         def __getitem__(self, key: object) -> Any:
-            return self.aio[key]  # The cell raises a TypeError with a suggestion.
+            return self.aio[key]  # `aio` raises a TypeError with a suggestion.
 
 
 class IteratorTwin(TwinOf[IteratorT], Generic[IteratorT, ItemT]):
@@ -352,7 +352,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
             try:
                 original = read() if self._loop.is_current else self._loop.call(read)
             except ConnectionClosed:
-                original = read()  # The loop has ended, so no other thread uses the vehicle any more.
+                original = read()  # The loop's thread has ended, so this thread may use the vehicle.
             vars(self).setdefault(key, twin(self._loop, original))
         part: T = vars(self)[key]
         return part
@@ -367,7 +367,7 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         is_hold_pending = self.aio.is_hold_pending
         self.close()
-        # `close` does not pass the exception to the asynchronous context, which would log this warning.
+        # The asynchronous context would log this warning, but `close` exits it without the exception.
         if exc is not None and not is_hold_pending:
             warn_if_left_flying(self.aio)
 

@@ -75,7 +75,7 @@ class FleetTwin(OpenedTwin["AsyncFleet"]):
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         without_hold = [vehicle for vehicle in self.aio.vehicles.values() if not vehicle.is_hold_pending]
         self.close()
-        # `close` does not pass the exception to the asynchronous context, which would log this warning.
+        # The asynchronous context would log this warning, but `close` exits it without the exception.
         if exc is not None:
             for vehicle in without_hold:
                 warn_if_left_flying(vehicle)

@@ -123,7 +123,7 @@ class LoopThread:
                 with contextlib.suppress(AerokitError):
                     self._start(call)
             if call is not None:
-                self._cancel(call)  # With `is_shielded`, the function shields its own clean-up.
+                self._cancel(call)  # The function must itself shield its clean-up from this cancellation.
                 wait_s = SIGNAL_CHECK_INTERVAL_S if is_shielded else INTERRUPTED_CALL_TIMEOUT_S
                 while call.is_scheduled and not call.wait(wait_s):
                     must_wait_on = is_shielded and self._thread.is_alive()
@@ -342,8 +342,8 @@ class _Calls:
         call.has_started = True
         task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        # A task that is cancelled before its first step does not finish its call, so `finish` is called here. After
-        # `run`, this has no effect.
+        # `run` does not finish a call whose task was cancelled. Without this callback, its caller would wait forever.
+        # A second `finish` has no effect.
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:

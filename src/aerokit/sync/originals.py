@@ -213,7 +213,7 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
     arguments: dict[str, str] = {}
     for base in getattr(cls, "__orig_bases__", ()):
         names = [parameter.__name__ for parameter in getattr(get_origin(base), "__parameters__", ())]
-        # Either all arguments of a base are forward references, or none is. If none is, nothing is replaced.
+        # The type arguments of a base are all forward references, or none is. In the latter case, nothing is replaced.
         values = [argument.__forward_arg__ for argument in get_args(base) if isinstance(argument, ForwardRef)]
         arguments |= dict(zip(names, values))  # noqa: B905 - `values` may be empty
 

@@ -119,7 +119,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # If a poll is due, the next iteration polls. Without timers, it runs the event sources again.
+            # If a poll is due, it happens in the next iteration. Without a timer, the clock cannot jump.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             # No event source is due before the next timer, so the clock jumps to the timer.
@@ -165,8 +165,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 if due < earliest_due:
                     earliest_due = due
                     earliest_handle = handle
-            # Stop if the next timer is due earlier or at the same instant. The loop runs the event sources of that
-            # instant together with the timer.
+            # Stop at the next timer. The loop runs the event sources of the same instant together with that timer.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)

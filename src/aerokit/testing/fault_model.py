@@ -114,8 +114,8 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        # Draw five random numbers for every frame, even for a lost frame. If one probability changes, the other faults
-        # then still affect the same frames.
+        # Draw five random numbers for every frame, even for a lost frame. A change of one probability then leaves the
+        # other faults at the same frames.
         model = self.model
         chance = self._chance
         is_lost = chance() < model.loss

@@ -14,7 +14,7 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# Calls its argument, a function that schedules faults, with the scheduler of the flight.
+# Passes the flight's scheduler to its argument, a function that schedules faults.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
@@ -42,7 +42,7 @@ class FaultInjector:
         def is_true() -> bool:
             return condition(true_point(self._vehicle))
 
-        # The new injector gets the scheduler only when the condition is true, so its times count from then on.
+        # `schedule` is called when the condition is first true, so the times of its faults count from then on.
         def with_scheduler_when_true(schedule: Callable[[FlightScheduler], None]) -> None:
             self._with_scheduler(lambda scheduler: scheduler.do_when(is_true, partial(schedule, scheduler)))
 

@@ -207,7 +207,7 @@ class FaultyLink(Link):
         """Resume sending after :meth:`stall`."""
         if self._stalled_queue is not None:
             self._stalled_queue.drain()
-            self._on_stalled(False)  # A queue that a second `stall` replaced does not report the end of its stall.
+            self._on_stalled(False)  # After a second `stall`, the first queue is closed and reports no end.
 
     async def open(self, receiver: Receiver) -> None:
         if self._is_closed:
@@ -286,7 +286,7 @@ class FaultyLink(Link):
     def _on_stalled(self, is_stalled: bool) -> None:
         stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
-        if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
+        if self._incoming_path is None or is_stalled == was_stalled:
             return
         now = asyncio.get_running_loop().time()
         if stalled_at is None:  # The stall begins.
@@ -327,7 +327,7 @@ class _IncomingPath:
 
     def link_lost(self, error: LinkLost) -> None:
         self._on_lost()
-        if not self._is_closed:  # The receiver first gets the frames in transit.
+        if not self._is_closed:  # The error arrives after all frames in transit.
             self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
 
     def link_stalled(self, unsent_bytes: int) -> None:
@@ -408,8 +408,8 @@ class _DeliveryQueue:
                     break
                 heappop(self._waiting)
                 action()
-        finally:  # If an action raises an exception, the event loop reports it, and a new timer runs the other actions.
-            # An action may have called `put`, which started a timer. The timer's own action may have run meanwhile.
+        finally:  # If an action raises an exception, a new timer runs the remaining actions.
+            # `self._timer` is the timer that has fired, or one that an action has started by calling `put`.
             if self._timer is not None:
                 self._timer.cancel()
                 self._timer = None

@@ -79,7 +79,7 @@ class Interruption:
 
 def _is_sigint_available() -> bool:
     """Return True if an Interruption may replace the handler of SIGINT."""
-    # SIG_IGN may be replaced, because shells set it for background jobs of a script.
+    # Shells set SIG_IGN for the background jobs of a script, so this handler may be replaced, too.
     handler = signal.getsignal(signal.SIGINT)
     is_of_interruption = isinstance(getattr(handler, "__self__", None), Interruption)
     return is_of_interruption or handler in (signal.default_int_handler, signal.SIG_IGN)

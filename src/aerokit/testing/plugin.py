@@ -201,7 +201,7 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
     test: Callable[..., Any] = item.obj
     marked_test = getattr(test, _TEST_WITH_OPEN_FLIGHTS, None)
     if marked_test is not None:  # The test has the asyncio marker.
-        # pytest-asyncio may have replaced the test by a plain function, which runs it on pytest-asyncio's loop.
+        # A plain function is a wrapper by pytest-asyncio, which runs the test on pytest-asyncio's own loop.
         wrapped_by_pytest_asyncio = None if inspect.iscoroutinefunction(test) else test
         return _on_virtual_time(marked_test, try_first=wrapped_by_pytest_asyncio)
     if not fleets or not inspect.iscoroutinefunction(test):

@@ -325,7 +325,7 @@ class RecordedVehicle(SimulatedVehicle):
                 target_component=component_id,
             )
             self.call_later(delay, partial(self.send, readdressed, command.channel))
-        return None  # The acknowledgements were recorded, so no further one is sent.
+        return None  # The simulator sends no COMMAND_ACK besides the recorded ones.
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
         """Return the next recorded answer to a command; None if none was recorded.

@@ -139,7 +139,7 @@ class RecordedFlight:
         if isinstance(message, _COMMANDS):
             is_repetition = isinstance(message, m.CommandLong) and message.confirmation > 0
             answers = self.answers.setdefault(message.command, [])
-            if not answers or not is_repetition:  # A repetition has no answer of its own.
+            if not answers or not is_repetition:  # A repeated command shares the answer to the first one.
                 params = (message.param1, message.param2, message.param3, message.param4)
                 answers.append(RecordedAnswer(params, now))
         elif isinstance(message, m.ParamSet):

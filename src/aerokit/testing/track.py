@@ -278,8 +278,7 @@ class Track(Sequence[TrackPoint]):
         for point in self:
             up = 0.0 if altitude is None else point.altitude_m - altitude
             offset = (*offset_of(point), up)
-            # Measure the distance from `place` to the line between the previous point and this one, because the vehicle
-            # was also between them.
+            # The line between the previous point and this one may be nearer to `place` than both points.
             distance = _distance_of_origin(offset if previous_offset is None else previous_offset, offset)
             if distance < min_distance:
                 min_distance = distance

@@ -68,7 +68,7 @@ def test_no_point_is_farther_than_stated(places: list[Place], max_points: int, t
     rows, stated = simplify(places, max_points, tolerance)
     assert rows == sorted(set(rows))
     known = [row for row, place in enumerate(places) if not math.isnan(place[0])]
-    # Each known row is drawn, or between two drawn rows without a gap.
+    # Each known row is drawn, or lies between two drawn rows without a gap.
     for row in known:
         before = max((drawn for drawn in rows if drawn <= row), default=None)
         after = min((drawn for drawn in rows if drawn >= row), default=None)
@@ -247,7 +247,7 @@ OPPONENTS = (
     (1.9779985, -2.42859221, 0.45059371),
     (0.02590404, 0.78277177, -0.80867577),
 )
-# Okabe and Ito's palette has 0.076 for protan and deutan.
+# For comparison: the palette of Okabe and Ito has 0.076 with protan and deutan vision.
 MIN_OKLAB_DISTANCE = 0.068
 
 

@@ -170,7 +170,7 @@ async def test_take_off_refused_while_rising_says_why() -> None:
         vehicle = flight.vehicle
         await vehicle.wait_ready()
         await vehicle.arm()
-        await vehicle.take_off(30.0)  # Returns just below this altitude.
+        await vehicle.take_off(30.0)  # The call returns just below this altitude.
         with pytest.raises(CommandRejected, match="the vehicle is taking off"):
             await vehicle.take_off(40.0)
 

@@ -41,7 +41,7 @@ async def orbit(flight: Any) -> None:
 
 async def loiter(flight: Any) -> None:
     here = place_of(flight)
-    # Without an altitude, the vehicle on the ground is still at the place.
+    # Without an altitude, a vehicle that lies on the ground counts as being at the place.
     await flight.vehicle.loiter(Position(here.latitude_deg, here.longitude_deg), duration_s=60.0)
 
 

@@ -45,7 +45,7 @@ async def test_late_arming_counts_only_later_reports(grounded: Flight) -> None:
     assert scope.cancelled_caught
     detach()
     assert grounded.vehicle.is_armed
-    grounded.copter.arming.disarm()  # By another party, before the next heartbeat.
+    grounded.copter.arming.disarm()  # Another party disarms the vehicle before the next HEARTBEAT.
     await anyio.sleep(5.0)
     assert ordered(grounded) == [1]
 

@@ -49,7 +49,7 @@ async def test_land_while_sticks_read_parameters_stands() -> None:
 
         async def land() -> None:
             await anyio.sleep(1.0)
-            with suppress(CommandTimeout):  # The link is slow; the vehicle lands.
+            with suppress(CommandTimeout):  # The link is slow, but the vehicle gets the command and lands.
                 await flight.vehicle.set_mode("LAND")
 
         tasks.start_soon(land)

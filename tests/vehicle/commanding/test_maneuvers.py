@@ -316,7 +316,7 @@ async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., Simul
         places = await places_during(vehicle, loiter)
         assert center.distance_to(places[-1]) == pytest.approx(120, abs=36)
         assert turns_around(center, [p for p in places if center.distance_to(p) < 156]) < -0.9
-        await vehicle.go_to(center.offset(north_m=300), timeout=120)  # ArduPlane keeps the radius.
+        await vehicle.go_to(center.offset(north_m=300), timeout=120)  # ArduPlane keeps the radius of the loiter.
 
 
 @pytest.mark.parametrize(("kind", "radius"), [(SimulatedPlane, "WP_LOITER_RAD"), (SimulatedPx4Plane, "NAV_LOITER_RAD")])

@@ -254,7 +254,7 @@ async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> Non
     sent = [
         at for command in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(command)
     ]
-    assert sent == [started] * 3  # Once each: HEARTBEAT reported the effects of the unacknowledged commands.
+    assert sent == [started] * 3  # None is repeated: HEARTBEAT reported the effects of the unacknowledged commands.
     await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0) > 4.5, timeout=20)
 
 

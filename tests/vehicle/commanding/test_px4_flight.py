@@ -77,7 +77,7 @@ async def test_lost_take_off_is_repeated_although_home_moves() -> None:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()
         flight.px4.faults.ignore(MavCmd.NAV_TAKEOFF, times=1)
-        asyncio.get_running_loop().call_later(0.3, move_home_up, flight, -2.0)  # This is no climb.
+        asyncio.get_running_loop().call_later(0.3, move_home_up, flight, -2.0)  # A lower home is no climb.
         await flight.vehicle.take_off(12.0, timeout=30.0)
         assert len(flight.wire.commands(MavCmd.NAV_TAKEOFF)) == 2
 

@@ -102,7 +102,7 @@ async def test_random_orders_are_no_takeovers_and_leave_vehicle_at_rest(seed: in
                 disturb(flight, rng)
                 tasks.start_soon(give, rng.choice(list(orders)), rng.choice((None, None, rng.uniform(0, 3))))
                 await anyio.sleep(rng.choice((0.0, rng.uniform(0, 1.5))))
-        # Only this program changes the mode.
+        # No pilot changes the mode here, so no order may be reported as ended by a mode change.
         assert not [row for row in given if "the mode changed to" in row[2] or "the vehicle left" in row[2]]
         await anyio.sleep(15)
         simulated = flight.copter if isinstance(flight, Flight) else flight.px4

@@ -49,7 +49,7 @@ async def test_terminate_other_intent_sends_nothing(intent: str) -> None:
 
 async def test_terminate_ignores_states_before_the_command() -> None:
     async with in_the_air() as flight:
-        flight.copter.faults.refuse(TERMINATE, MavResult.ACCEPTED)  # It answers ACCEPTED, and executes nothing.
+        flight.copter.faults.refuse(TERMINATE, MavResult.ACCEPTED)  # The vehicle accepts, but does nothing.
         state = flight.vehicle.telemetry.system_status
         state.set(MavState.FLIGHT_TERMINATION, Source(1, 1, "HEARTBEAT"))
         with pytest.raises(OperationTimeout, match="still armed"):

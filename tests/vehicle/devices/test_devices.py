@@ -393,7 +393,7 @@ async def test_log_stream_without_usable_data_times_out(target: int) -> None:
         flight.px4.faults.lost_messages.update({m.LoggingData.ID: 10_000, m.LoggingDataAcked.ID: 10_000})
 
         async def send() -> None:
-            for sequence in range(1000):  # The message with the header was lost.
+            for sequence in range(1000):  # The messages lack the header of the log, which was lost.
                 data = m.LoggingData(target, 190, sequence, 3, 0, b"abc".ljust(249, b"\0"))
                 flight.wire.deliver(FrameEncoder(1, 1).encode(data))
                 await anyio.sleep(0.5)

@@ -138,7 +138,7 @@ async def test_rename_and_remove(bench: Bench) -> None:
 
 
 async def test_crc32_of_the_vehicle(bench: Bench) -> None:
-    # of "123456789", with nothing inverted
+    # The CRC-32 of "123456789" without the usual inversions.
     assert await bench.files.crc32(bench.put("check", b"123456789")) == 0x2DFD2D88
 
 

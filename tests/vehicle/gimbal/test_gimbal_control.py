@@ -703,7 +703,7 @@ async def test_px4_rates_use_set_attitude() -> None:
         async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
             await stream.turn(-5.0, 10.0, 1.0)
         assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
-        sent = flight.wire.all(m.GimbalManagerSetAttitude)[5]  # The last ones have the final rate of zero.
+        sent = flight.wire.all(m.GimbalManagerSetAttitude)[5]  # The last messages have a rate of zero.
         assert all(map(math.isnan, sent.q))
         assert math.degrees(sent.angular_velocity_y) == pytest.approx(-5.0)
         assert math.degrees(sent.angular_velocity_z) == pytest.approx(10.0)

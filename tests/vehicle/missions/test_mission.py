@@ -220,7 +220,7 @@ async def test_px4_old_completion_does_not_finish_mission_of_disarmed_vehicle() 
         starting = asyncio.ensure_future(mission.start())
         while flight.px4.mode != px4_modes.MISSION:  # noqa: ASYNC110
             await anyio.sleep(0.01)
-        flight.px4.faults.lose(m.MissionCurrent, times=2)  # None reports the mission as active.
+        flight.px4.faults.lose(m.MissionCurrent, times=2)  # No MISSION_CURRENT reports the mission as active.
         await starting
         flight.px4.arming.disarm("a pilot", force=True)
         flight.px4.mission.is_finished = True
@@ -329,7 +329,7 @@ async def test_mission_from_takeoff_to_end(opened: Any, end: MissionItem | None)
             observed = all_of(reported)
         reached = [event.item for event in observed if isinstance(event, events.MissionItemReached)]
         assert reached == sorted(set(reached))
-        assert reached[:2] == [0, 1]  # PX4 may leave one out
+        assert reached[:2] == [0, 1]  # PX4 may leave out a later item.
         assert mission.reached == reached[-1]
         current = [event.after for event in observed if isinstance(event, events.MissionCurrentChanged)]
         assert [item for item in current if item][:2] == [1, 2]
@@ -429,7 +429,7 @@ async def test_wait_finished_continues_through_pause_at_once_after_resume() -> N
             tasks.start_soon(mission.wait_finished)
             await anyio.sleep(1.0)
             detach = flight.vehicle.mode.observe(pause_at_once)
-            flight.copter.faults.lose(m.Heartbeat, times=1)  # The acknowledgement arrives first.
+            flight.copter.faults.lose(m.Heartbeat, times=1)  # COMMAND_ACK arrives before HEARTBEAT reports the mode.
             await mission.resume()
             detach()
             await pauses[0]
@@ -800,7 +800,7 @@ async def test_active_mission_is_replaced_but_not_cleared() -> None:
         await flight.vehicle.mission.start()
         flight.wire.clear()
         await flight.vehicle.mission.upload(Mission([*short_mission(flight), return_to_launch()]))
-        assert flight.wire.all(m.MissionCount)  # ArduPilot cannot empty it for a file
+        assert flight.wire.all(m.MissionCount)  # ArduPilot cannot clear an active mission to write it as a file.
         assert flight.vehicle.mission.count.value == 4
         assert flight.vehicle.mode_name == "AUTO"
 

@@ -55,7 +55,7 @@ async def test_set_current_of_return_that_changes_the_mode_succeeds() -> None:
         await flight.vehicle.mission.upload(missions.Mission(items))
         await flight.vehicle.mission.start()
         await anyio.sleep(1.1)
-        flight.px4.faults.lose(m.MissionCurrent, times=2)  # HEARTBEAT reports RTL first
+        flight.px4.faults.lose(m.MissionCurrent, times=2)  # HEARTBEAT reports RTL before any MISSION_CURRENT arrives.
         await flight.vehicle.mission.set_current(1)
         assert flight.vehicle.mode.value.name == "RTL"
         assert flight.vehicle.mission.current.value == 1

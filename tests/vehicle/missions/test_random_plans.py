@@ -47,7 +47,7 @@ class CheckedPlans:
                 await plans.upload(plan, method=method, verify=rng.random() < 0.8, only_changes=rng.random() < 0.8)
                 assert self._numbers(plan.to_items()) == self._on_vehicle(name)
                 self._uploaded[name] = plan
-        except OperationTimeout as error:  # The link is bad. Any other error would be a false report.
+        except OperationTimeout as error:  # On this bad link, a time-out is the only error that may be reported.
             self._check_error(error, name, before)
 
     def _check_error(self, error: OperationTimeout, name: str, before: list[tuple[float, ...]]) -> None:

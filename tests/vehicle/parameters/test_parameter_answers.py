@@ -177,7 +177,7 @@ async def test_reads_after_early_answers_wait_for_slow_link() -> None:
     async with open_flight(latency_s=0.15) as flight:
         copter, parameters = flight.copter, flight.vehicle.parameters
         await anyio.sleep(3.0)
-        for _ in range(20):  # Each answer leaves the vehicle before the request, and arrives after it.
+        for _ in range(20):  # Each PARAM_VALUE is sent before the request, and arrives after the request was sent.
             copter.send(ParamValue("RTL_ALT", 1500, ParameterType.REAL32, 1, 0))
             await anyio.sleep(0.14)
             await parameters.get("RTL_ALT")

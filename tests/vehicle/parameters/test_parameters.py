@@ -537,7 +537,7 @@ async def test_upload_by_file_keeps_value_set_during_read_back() -> None:
         def set_at_first_read(message: messages.ParamRequestRead, channel: Any) -> None:
             if writes:
                 on_read(message, channel)
-            else:  # This request is lost, so the value is read after the other task has written it.
+            else:  # The first request is not answered, so the upload reads the value after the other task has set it.
                 writes.append(asyncio.create_task(parameters.set("RTL_ALT", 3000)))
 
         simulated.handlers[messages.ParamRequestRead.ID] = set_at_first_read
@@ -856,7 +856,7 @@ async def test_reboot_before_list_is_cached_repeats_the_download(tmp_path: Path)
         def reboot_at_last_hash(message: messages.ParamValue) -> None:
             nonlocal answers
             answers += message.param_id == "_HASH_CHECK"
-            if answers == 3:  # The first precedes the list, the second begins it.
+            if answers == 3:  # The first _HASH_CHECK precedes the list, the second begins it, the third is the last.
                 parameters._access.forget()
 
         flight.vehicle.connection.bus.attach(messages.ParamValue, reboot_at_last_hash)

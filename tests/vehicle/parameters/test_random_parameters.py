@@ -141,7 +141,7 @@ async def test_reported_parameters_are_true_on_bad_links(seed: int, tmp_path: Pa
                     with anyio.fail_after(MAX_CALL_S), anyio.CancelScope() as scope:
                         if rng.random() < 0.15:
                             scope.deadline = anyio.current_time() + rng.uniform(0, 3)
-                        # The link is bad. Any other error would be a false report.
+                        # On this bad link, these are the only errors that may be reported.
                         with contextlib.suppress(OperationTimeout, RollbackFailed):
                             await rng.choice(choices)()
                     await anyio.sleep(rng.choice((0.0, 0.0, rng.uniform(0, 8))))

@@ -34,7 +34,7 @@ async def served(vehicle: SimulatedVehicle, speedup: float) -> AsyncIterator[Veh
 async def test_fast_simulation_reboot_is_detected(kind: str, speedup: float) -> None:
     simulated = KINDS[kind](boot_time_s=1.0)
     async with served(simulated, speedup) as vehicle:
-        await anyio.sleep(0.3)  # Its first time was reported long ago.
+        await anyio.sleep(0.3)  # After this time, the vehicle has reported its clock several times.
         with vehicle.subscribe(VehicleRebooted, capacity=5) as events:
             await vehicle.reboot(timeout=10.0)
             assert simulated.uptime < 12.0

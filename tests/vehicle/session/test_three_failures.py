@@ -230,7 +230,7 @@ def test_program_with_timed_out_calls_exits() -> None:
             [sys.executable, "-W", "error", "-c", textwrap.dedent(PROGRAM), f"udpin:127.0.0.1:{silent.port}"],
             capture_output=True,
             text=True,
-            timeout=30,  # It takes two seconds; a comparable library was reported never to end.
+            timeout=30,  # The program takes two seconds. In another library, it was reported never to end.
             check=False,
         )
     reported = ["connected", "timeout", "timeout", "timeout", "cancelled", "left", "done"]

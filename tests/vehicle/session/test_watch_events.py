@@ -332,7 +332,7 @@ async def test_values_have_time_and_source(grounded: Flight) -> None:
     grounded.copter.faults.silent = True
     await anyio.sleep(2.5)
     assert vehicle.attitude.age == pytest.approx(2.5, abs=0.15)
-    assert vehicle.attitude.value is vehicle.attitude.latest  # Old, with the age to show it.
+    assert vehicle.attitude.value is vehicle.attitude.latest  # `value` returns an old value, too.
     with pytest.raises(StaleValueError, match=r"attitude is 2\.\d s old.*no ATTITUDE since"):
         vehicle.attitude.fresh(within=1.0)
     assert vehicle.attitude.fresh(within=5.0)

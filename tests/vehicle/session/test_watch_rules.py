@@ -222,7 +222,7 @@ def watched_without_link(speed: int = 1) -> Watched:
 @pytest.mark.parametrize("speed", [1, 10])
 @pytest.mark.parametrize(
     ("back_s", "reboots"),
-    # 60 s ± 1.5 s ± 20 % of 10 s, because the speed is known to 15 % after 10 s
+    # Limits of a continued clock: 60 s ± 1.5 s ± 20 % of 10 s, because after 10 s the speed is known to 15 %.
     [(56.6, 0), (63.4, 0), (56.0, 1), (64.0, 1), (20.0, 1), (900.0, 1)],
 )
 def test_clock_that_does_not_continue_after_lost_link_is_reboot(speed: int, back_s: float, reboots: int) -> None:

@@ -119,7 +119,7 @@ def test_plane(flights: Flights) -> None:
     assert flight.armed == [False, True, False]
     assert flight.landed == [1, 2, 1]
     assert flight.highest_m == pytest.approx(70, abs=2)
-    assert flight.farthest_m < 2000  # It reported a place near 0°N 0°E before its first fix.
+    assert flight.farthest_m < 2000  # The plane reported a place near 0° N 0° E before its first fix.
     assert flight.telemetry.air_speed_m_s.is_known
 
 

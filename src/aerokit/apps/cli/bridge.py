@@ -104,7 +104,7 @@ def _add_common(action: argparse.ArgumentParser, *, rate_of: str, default_hz: fl
 
 
 def _network(text: str) -> str:
-    # Checked before a link is opened, because users easily swap the two addresses.
+    # Users easily swap the two addresses of this command, so they are checked before a link is opened.
     if parse_address(address(text)).kind not in ("zenoh", "zenohin"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a zenoh address; expected zenoh://FLEET/NAME")
     return text
@@ -204,5 +204,5 @@ def _emit_serving(options: argparse.Namespace, bridge: FoxgloveBridge) -> None:
 
 def _emit_vehicle(options: argparse.Namespace, vehicle: Vehicle) -> None:
     record = {"system_id": vehicle.system_id, "firmware": vehicle.autopilot.firmware}
-    if can_print():  # Otherwise, printing would block the event loop.
+    if can_print():  # Printing to a stopped terminal would block the event loop.
         emit(options, "bridged_vehicle", record, f"vehicle {vehicle.system_id}: {vehicle.autopilot.firmware}")

@@ -190,7 +190,7 @@ def lines_of(step: CalibrationStep) -> list[str]:
         lines = ["", f"  {step.pose.value.upper()} ({view})", *PICTURES[step.pose].strip("\n").splitlines(), _GROUND]
         if next_poses:
             lines.append(f"  then: {next_poses}")
-    # An instruction may be a text of the vehicle, of any length.
+    # An instruction may be a STATUSTEXT of the vehicle, which may be long.
     instruction = textwrap.wrap(step.instruction, 76, max_lines=3, placeholder=" ...")
     return [*lines, *(f"  {line}" for line in instruction)]
 

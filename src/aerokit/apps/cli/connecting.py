@@ -259,7 +259,7 @@ async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> Asy
 
     With ``reconnect``, a lost link is opened again.
     """
-    # Tests use a `Link` instead of an address. A `Link` cannot be opened again.
+    # In tests, the address may be a `Link`, which cannot reconnect because it can be opened only once.
     link: str | Link = options.address
     async with open_connection(
         link,

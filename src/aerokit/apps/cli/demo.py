@@ -140,7 +140,7 @@ class _SquareFlight(SupervisedFlight):
     async def _take_off(self, altitude_m: float) -> None:
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready")
-        # This only asks whether there is a command to take off. Nothing is sent, and home's altitude does not matter.
+        # Check before arming that the autopilot can take off. This sends nothing, and works with any altitude of home.
         if vehicle.autopilot.take_off(altitude_m, home_altitude_amsl_m=0.0, is_vtol=vehicle.is_vtol) is None:
             raise NotSupported(f"demo: {vehicle.autopilot.firmware} cannot take off")
         await record_parameters(vehicle, self._print)
@@ -154,7 +154,7 @@ class _SquareFlight(SupervisedFlight):
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # If another party has changed the mode, it may also have ordered a hold or a landing.
+        # After a mode change by another party, a mode to hold or to land may be that party's.
         return ("take_off", "setpoint") if self._was_overruled else ("take_off", "setpoint", "hold", "land")
 
     async def _after_failure(self, error: Exception) -> int:

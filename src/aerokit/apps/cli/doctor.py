@@ -43,12 +43,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 """Maps extras to their modules. A test compares them with pyproject.toml."""
 
-# Each network port has a number, a usual purpose, and True for UDP or False for TCP.
-_COMMON_PORTS = (
-    (14550, "the port of ground stations such as QGroundControl and MAVProxy", True),
-    (14540, "PX4's simulator sends to it", True),
-    (5760, "ArduPilot's simulator listens on it", False),
-)
+_COMMON_UDP_PORTS = {
+    14550: "the port of ground stations such as QGroundControl and MAVProxy",
+    14540: "PX4's simulator sends to it",
+}
+_COMMON_TCP_PORTS = {5760: "ArduPilot's simulator listens on it"}
 # How long to listen at each baud rate: long enough for two heartbeats.
 BAUD_RATE_TIMEOUT_S = 2.5
 
@@ -175,8 +174,9 @@ def _check_computer(report: Callable[[Finding], None]) -> None:
             " virtual machine or container"
         )
         report(Finding("note", "serial ports", "none found", advice))
-    for number, meaning, is_udp in _COMMON_PORTS:
-        report(check_network_port(number, meaning, udp=is_udp))
+    for purposes, is_udp in ((_COMMON_UDP_PORTS, True), (_COMMON_TCP_PORTS, False)):
+        for number, purpose in purposes.items():
+            report(check_network_port(number, purpose, udp=is_udp))
     report(Finding("ok", "next", "only this computer was checked", "check a link: aerokit doctor ADDRESS"))
 
 

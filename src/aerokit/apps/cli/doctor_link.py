@@ -122,8 +122,7 @@ class LinkExamination:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._own_ids = (connection.source_system, connection.source_component)
-        # The keys are pairs of system and component id. If a pair has several entries in `_types_and_autopilots`,
-        # several senders use these ids.
+        # Keys are (system id, component id). A key with several entries in `_types_and_autopilots` has several senders.
         self._versions: dict[tuple[int, int], set[int]] = {}
         self._signed: Counter[tuple[int, int]] = Counter()
         self._frames: Counter[tuple[int, int]] = Counter()

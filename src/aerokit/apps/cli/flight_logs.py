@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-# What `Conversion.written` counts, by suffix of the converted file. For all other suffixes, it counts rows.
+# Maps the suffix of a converted file to what `Conversion.written` counts. For other suffixes, it counts rows.
 _WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 _REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 

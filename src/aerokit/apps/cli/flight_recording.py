@@ -59,7 +59,7 @@ async def record_to_end(
         f" is silent for {MAX_SILENCE_S:g} s, or Ctrl-C"
     )
 
-    # A crashed vehicle may stay armed, so stillness ends the wait, too. `speedup` is above 1 in a fast simulation.
+    # A crashed vehicle may stay armed, so the wait ends if it lies still. `speedup` is above 1 in a fast simulation.
     stillness = _StillnessNearGround(vehicle, _MAX_STILL_S / speedup)
 
     async def wait() -> int:
@@ -92,7 +92,7 @@ class _StillnessNearGround:
         has_moved = self._still_at is None or position.distance_to(self._still_at) > _MAX_DRIFT_M
         height_m = position.altitude_relative_m
         is_near_ground = height_m is not None and abs(height_m) <= _MAX_HEIGHT_M
-        # If the position is old or has no height, the vehicle may be moving or high.
+        # Only a recent position near the ground can show that the vehicle lies still.
         if is_old or has_moved or not is_near_ground:
             self._still_at = position
             self._still_since = now

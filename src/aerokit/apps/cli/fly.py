@@ -60,8 +60,8 @@ class PlanFlight(SupervisedFlight):
         self.sent_text = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
         self.sent_text = "the plan is on the vehicle, nothing was armed"
-        # The mission is compared again before the start, because another ground station may have changed it. Other
-        # stations cannot reach a vehicle that this program simulates.
+        # Another ground station may change the mission before the start. It cannot reach a vehicle that this program
+        # simulates.
         uploaded_mission = () if self._options.sim else await self._download_mission()
         if self._options.record is not None:
             await record_parameters(vehicle, self._print)
@@ -155,12 +155,12 @@ class PlanFlight(SupervisedFlight):
 
     async def _explain_wait(self, mode: str) -> None:
         """Print how long the flight waits for the end of the mission after a change to ``mode``."""
-        delay_s = END_GRACE_S / 4  # Within this time, the mission may end, or the vehicle may leave the mode.
+        delay_s = END_GRACE_S / 4  # Nothing is printed about a mode that the vehicle leaves within this time.
         await anyio.sleep(delay_s)
         vehicle = self._vehicle
         is_unexplained = vehicle.mode_name == mode and not self._is_in_our_mode and not vehicle.mission.explains_mode
         if self._has_changed_mode and is_unexplained:
-            # The grace period is real time, but the text has the vehicle's time, which a simulation speeds up.
+            # END_GRACE_S is real time. The printed time is that of the vehicle, which is longer in a fast simulation.
             seconds = format_value(self._report.speedup * (END_GRACE_S - delay_s))
             self._print(f"waiting {seconds} s for the end of {mode} or a report that the mission has ended")
 
@@ -176,8 +176,8 @@ class PlanFlight(SupervisedFlight):
         return DONE
 
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        # A failsafe may have set a mode to land or return, so these modes do not count as set by this program. A
-        # cancelled start of the mission ends in a mode to hold.
+        # The purposes "land" and "return" are left out, because a failsafe may have set their modes. "hold" is the
+        # purpose of the mode after a cancelled start of the mission.
         return ("mission",) if self._has_changed_mode else ("mission", "hold")
 
 
@@ -213,7 +213,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_record(command)
     add_vehicle(command)
     add_json(command)
-    # `run_fly` must know whether --connect is given, so it fills in the default address itself.
+    # `run_fly` fills in the default address, because it must know whether --connect is given.
     command.set_defaults(run=run_fly, connect=None)
     # argparse has no public list of a group's options.
     command.set_defaults(simulation_actions=tuple(simulated._group_actions))
@@ -226,7 +226,7 @@ async def run_fly(options: argparse.Namespace) -> int:
         items = getattr(plan, part).to_items()
         if items:
             emit_items(options, part, items, state="in the file")
-    # `_connect_and_fly` appends the flight, so that the flight's state is known here after an interrupt.
+    # `_connect_and_fly` appends the flight, so that this function knows its state after an interrupt.
     flights: list[PlanFlight] = []
     interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):
@@ -281,8 +281,7 @@ async def _connect_and_fly(
             except AerokitError as flight_error:  # raised again below, after the summary
                 error = flight_error
                 code = FAILED
-                # A failsafe may still land the vehicle, even if the vehicle is simulated. The recording should contain
-                # the landing.
+                # After an error, a failsafe may land even a simulated vehicle, which the recording should contain.
                 continues_recording = True
             if continues_recording and flight.has_sent_arm_command and options.record is not None:
                 await record_to_end(vehicle, interrupts, report.print_line, report.speedup)

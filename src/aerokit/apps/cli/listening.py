@@ -115,7 +115,7 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
         message = STANDARD.get(message_id)
         messages[str(message_id) if message is None else message.NAME] += count
     systems = sorted({system_id for system_id, _ in counts})
-    # If no frame was received, no file was created. A file with this name is then an earlier recording.
+    # Without a received frame, this command creates no file. An existing file is an earlier recording.
     size = os.path.getsize(options.file) if counts else 0
     record = {
         "file": options.file,
@@ -235,7 +235,7 @@ def _printing_kept_name(path: str | None) -> Iterator[None]:
     if path is None or not os.path.isfile(path):
         yield
         return
-    # The link logs the new name of the renamed file, but Textual hides log messages.
+    # Textual hides the link's log message with the new name, so the name is found by the file's inode.
     earlier = os.stat(path)
     yield
     for kept in Path(path).resolve().parent.iterdir():

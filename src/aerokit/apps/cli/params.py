@@ -175,7 +175,7 @@ async def _set(options: argparse.Namespace) -> int:
             check_allowed(metadata, values)
         results = await vehicle.parameters.set_many(values, idle_timeout_s=options.patience)
         known_names = await _names_for_hints(vehicle, results.values())
-    # Without metadata, every result would have the same note. Text output then has a single line at the end instead.
+    # Without metadata, all results would have the same note. Text output has one line at its end instead.
     has_notes = metadata is not None or options.json
     if has_notes and not options.force:
         results = {
@@ -318,7 +318,7 @@ def _emit_results(
         else:
             text = f"{result.name:16} not set: {_with_hint(result.name, result.error, known_names)}"
         emit(options, "parameter_write", _record(result), text)
-        if result.error is not None and code in (DONE, FAILED):  # FAILED is less specific than the code of an error
+        if result.error is not None and code in (DONE, FAILED):  # An error's exit code is more specific than FAILED.
             code = exit_code(result.error)
         elif result.outcome == "clamped" and code == DONE:
             code = FAILED

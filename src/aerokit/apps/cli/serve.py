@@ -170,7 +170,7 @@ def _server_class(uvicorn: Any) -> Any:
     class Server(uvicorn.Server):  # type: ignore[misc]
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
-            yield  # The command handles signals itself.
+            yield  # uvicorn's own method installs signal handlers, which would replace those of `aerokit serve`.
 
         async def startup(self, sockets: Any = None) -> None:
             await super().startup(sockets=sockets)

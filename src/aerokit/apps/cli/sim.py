@@ -51,7 +51,7 @@ _CLIENT_SCHEMES = {
     "zenohin": "zenoh",
 }
 
-# Printed instead of an address that only the user knows.
+# A simulator knows its own end of a serial line, but not the device that a client opens.
 _SERIAL_LINE_PLACEHOLDER = "the other end of the serial line"
 
 

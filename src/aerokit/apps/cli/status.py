@@ -234,7 +234,7 @@ async def run_status(options: argparse.Namespace) -> int:
 
 async def _request_readiness(vehicle: Vehicle) -> Readiness:
     """Return what a vehicle lacks for arming and for flight, after requesting missing states."""
-    # If the vehicle is disarmed, `why_not_armable` requests the estimator's messages.
+    # `why_not_armable()` requests the estimator's messages itself if the vehicle is disarmed.
     needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()
     estimator_messages = [("estimator", message) for message in needed]
     for state, message in [*_REQUESTED, *estimator_messages]:

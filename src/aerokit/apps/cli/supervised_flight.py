@@ -198,7 +198,7 @@ class SupervisedFlight(ABC):
             elif action == "hold":
                 await vehicle.hold()
         except CommandRejected as error:
-            # For example, autopilots refuse to return without a position. The vehicle is then held instead.
+            # If the action fails (autopilots refuse to return without a position), the vehicle is told to hold instead.
             if action == "hold" or not self._still_has_control():
                 raise
             self._print(f"{text} failed: {plain_text(error)}; {INTERRUPT_ACTIONS['hold']} instead")
@@ -249,7 +249,7 @@ class SupervisedFlight(ABC):
         vehicle = self._vehicle
         has_only_armed = not (self._has_changed_mode or self._has_left_mode)
         if has_only_armed and vehicle.mode_name in self._modes_armed_in:
-            return self._is_armed_on_ground  # If the vehicle is in the air, a pilot has taken off.
+            return self._is_armed_on_ground  # This program has not taken off. If the vehicle flies, a pilot has.
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 
@@ -314,7 +314,7 @@ class FlightReport:
 
     def record_impact(self) -> None:
         if self._impact_s is None and self._armed_at is not None:
-            # The impact is detected only later, because the vehicle must first lie still for some time.
+            # The impact is detected after the vehicle has lain still. It happened at the end of the last fast descent.
             impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at
             self._impact_s = self._armed_s + impact_at - self._armed_at
 
@@ -410,7 +410,7 @@ class FlightReport:
 
     def _is_about_mode(self, text: str) -> bool:
         """Return True for a text like "Arm: AUTO mode not armable"."""
-        # This text needs no attention, because `Vehicle.arm` then changes the mode and arms again.
+        # `Vehicle.arm` solves this problem without the user: it changes the mode and arms again.
         autopilot = self._vehicle.autopilot
         mode = self._vehicle.mode_name
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"

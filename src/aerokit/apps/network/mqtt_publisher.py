@@ -167,7 +167,7 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
-        # Before Python 3.12 `asyncio.wait_for`, and before anyio 4.16 `move_on_after`, could lose a cancellation.
+        # Not `asyncio.wait_for` or `move_on_after`: before Python 3.12 and anyio 4.16, they could lose a cancellation.
         await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
         refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it an MQTT broker?)"
         if self._connect_result.done():

@@ -203,7 +203,7 @@ def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
 def _failures(operation: Operation) -> dict[str, Any]:
     if operation.is_open:
         return {}
-    # The statuses 413 and 415 concern request bodies.
+    # Without a request body, the statuses 413 and 415 cannot occur.
     impossible = set() if operation.order or operation.body_type else {"413", "415"}
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
@@ -507,7 +507,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
 
 
 async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
-    # Before Python 3.12 `asyncio.wait_for`, and before anyio 4.16 `move_on_after`, could lose a cancellation.
+    # Not `asyncio.wait_for` or `move_on_after`: before Python 3.12 and anyio 4.16, they could lose a cancellation.
     waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)

@@ -85,16 +85,13 @@ class FlightWatch:
 
     def _forget_impact(self) -> None:
         self._crash: dict[str, Any] | None = None
-        # The last impact; None if there was none.
         self._impact_at: float | None = None
         self._impact_altitude_m: float | None = None
         self._is_impact_dismissed = False  # True once the vehicle flies again or no evidence of a crash was found
-        # Start of the time without motion after the impact, and number of velocity reports since then.
-        self._still_since = math.inf
-        self._still_samples = 0
-        # Set after a crash: start of a movement, and altitude at which the vehicle reported a take-off.
-        self._moving_since = math.inf
-        self._take_off_altitude_m: float | None = None
+        self._still_since = math.inf  # when the vehicle stopped after the impact
+        self._still_samples = 0  # number of velocity reports after `_still_since`
+        self._moving_since = math.inf  # when the crashed vehicle began to move
+        self._take_off_altitude_m: float | None = None  # where the crashed vehicle reported a take-off
 
     def _restart_detection(self) -> None:
         self._forget_impact()
@@ -143,14 +140,14 @@ class FlightWatch:
         return None if known is None else float(known.value)
 
     def on_order(self, order: str) -> None:
-        # This order counts as the cause of a disarming shortly afterwards.
+        # A disarming within DISARM_ORDER_MAX_AGE_S after this order is not an automatic one.
         if order == "disarm":
             self._disarm_ordered_at = self._now()
 
     def _on_armed(self, before: bool | None, is_armed: bool) -> None:
         now = self._now()
         if is_armed:
-            # If no report of a disarmed vehicle came before, the vehicle may have been armed long ago.
+            # If `before` is None, this is the first report, and the vehicle may have been armed long ago.
             self._armed_at = now if before is False else None
             self._was_in_air = self._vehicle.landed_state.latest in _IN_AIR
             self._disarming = None
@@ -194,7 +191,7 @@ class FlightWatch:
             self._last_sink_m_s = down_m_s
             return
         has_hit_ground = bool(self._detector.describe())
-        # A vehicle that falls again, for example out of a tree, has a second impact.
+        # A vehicle may have a second impact, for example if it hits a tree and then falls out of it.
         is_new_impact = self._impact_at is None or self._impact_at < self._last_sink_at
         if not has_hit_ground:
             self._forget_impact()

@@ -93,7 +93,7 @@ def content_policy(tiles: str | None) -> str:
         url = urlsplit(tiles)
         is_url = url.scheme in ("http", "https") and url.hostname and "@" not in url.netloc
         lacks_placeholder = any(f"{{{axis}}}" not in tiles for axis in "xyz")
-        # In the Content-Security-Policy, these characters could end this source and begin another entry.
+        # With these characters, the URL could end its entry of the Content-Security-Policy and add another entry.
         has_separator = set(tiles) & set(" \t\n\"';,<>\\")
         if not is_url or lacks_placeholder or has_separator:
             raise InvalidArgument(
@@ -224,7 +224,7 @@ class _HttpConnection(H11Protocol):
                 self._anonymous.pop(self, None)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        self._remove_from_anonymous()  # The application itself limits the number of WebSockets.
+        self._remove_from_anonymous()  # WebSockets are not counted here: the application limits their number.
         super().handle_websocket_upgrade(event)
 
     def _start_timer(self) -> None:

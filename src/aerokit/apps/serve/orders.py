@@ -350,7 +350,7 @@ class OrderRunner:
             if earlier.is_same(vehicle.system_id, order_type.name, parsed.recorded):
                 return earlier
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
-        # The client may be retrying this same order. With a new key, it would be executed again.
+        # The order has ended, but its result is no longer stored. A retry must not execute it again.
         if key in self._used_keys:
             raise HttpProblem(
                 409,
@@ -428,7 +428,7 @@ class OrderRunner:
             if len(self._records) <= MAX_RESULTS:
                 break
             del self._records[key]
-            # The key stays used: a retry must not execute the order again.
+            # A client that retries with this key must not cause a second execution.
             self._used_keys[key] = None
         while len(self._used_keys) > MAX_USED_KEYS:
             self._used_keys.popitem(last=False)

@@ -109,7 +109,7 @@ class ServedVehicles:
 
     def crash(self, vehicle: Vehicle) -> dict[str, Any] | None:
         """Return the impact after which the vehicle has not moved; None if it may have moved."""
-        # A vehicle may have moved if it is silent, or reports no velocity.
+        # Without recent velocities, the vehicle may have moved since the impact.
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
         is_observed = is_connected and vehicle.velocity.age <= VELOCITY_MAX_AGE_S
         return self._flight_watch(vehicle).crash if is_observed else None
@@ -254,7 +254,7 @@ def _log_unexpected(error: Exception) -> None:
 def _thin_out(track: list[_TrackPoint]) -> None:
     """Remove every second point of a full track. The first and the last point stay."""
     removed_and_kept = zip(track[2::2], track[3::2], strict=False)
-    # If the first point after a gap is removed, the next point is marked instead.
+    # A kept point takes over the mark `is_after_gap` of the removed point before it.
     track[2:] = [
         _TrackPoint(kept.position, is_after_gap=kept.is_after_gap or removed.is_after_gap)
         for removed, kept in removed_and_kept

@@ -259,8 +259,8 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
             *[_cell(record.fields.get(name)) for name in names],
         ]
     parts = [column.field.partition(".") for column in columns]
-    # The rows begin with record[1:3], the system id and the component id. NAME is added, and then removed again,
-    # because attrgetter returns a tuple only for two or more names.
+    # attrgetter returns a tuple only for two or more names, so the unused NAME is added, and removed from each row.
+    # A row begins with record[1:3], the system id and the component id.
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
     text_positions = [position for position, column in enumerate(columns) if column.kind == "str"]

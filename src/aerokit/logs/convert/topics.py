@@ -283,7 +283,7 @@ def _schema_of(value: object) -> dict[str, Any]:
     if isinstance(converted, dict):
         return {"type": "object", "properties": {name: _schema_of(item) for name, item in converted.items()}}
     if isinstance(converted, list):
-        # Prefer the items of `value`: their classes have annotations, which tell more than the converted items.
+        # The items of `value` describe their types better than converted items, because their classes have annotations.
         items = value if isinstance(value, (list, tuple)) else converted
         return {"type": "array", "items": _schema_of(items[0]) if items else {}}
     return {} if converted is None else {"type": _JSON_TYPES[type(converted).__name__]}

@@ -76,7 +76,7 @@ class _TrackWriter:
 
     def _record_mission(self, record: LogRecord) -> None:
         message: Any = record.message
-        # It may not be known yet whether the sender or the receiver is the vehicle.
+        # Before a HEARTBEAT, it is unknown whether the sender or the receiver is the vehicle, so both get the mission.
         for system_id in {record.system_id, message.target_system}:
             if system_id not in self._missions:
                 self._missions[system_id] = RecordedMission(system_id)

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 # Pieces of evidence of the same kind belong to one failsafe if they are at most this time apart.
 _SAME_KIND_GAP_S = 8.0
-# Evidence of the kind "general" is added to a failsafe of a specific kind if both are at most this time apart.
+# Evidence that does not name the failure (kind "general") is added to a failsafe that is at most this time away.
 _GENERAL_GAP_S = 3.0
-# Replaces _GENERAL_GAP_S if the autopilot delays its reaction. Without satellites, autopilots continue with dead
-# reckoning for some seconds (PX4 for five). Before a return, PX4 holds for COM_FAIL_ACT_T seconds, usually five.
+# _GENERAL_GAP_S is too short if the autopilot delays its reaction: by dead reckoning after a loss of satellites (PX4:
+# five seconds), or by COM_FAIL_ACT_T (usually five seconds), for which PX4 holds before it returns.
 _DELAYED_REACTION_GAP_S = 10.0
 # A mode change or disarming is a reaction if it follows the last evidence of a failsafe within this time.
 _REACTION_TIMEOUT_S, _DISARMING_TIMEOUT_S = 12.0, 3.0
@@ -216,13 +216,12 @@ def _mode_change_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> 
     time_s, last_s = group[0].time_s, group[-1].time_s
     for change in flight.modes:
         is_near = time_s - _EARLY_MODE_CHANGE_S <= change.time_s <= last_s + _REACTION_TIMEOUT_S
-        # A mode change after disarming is no reaction to a failsafe: some autopilots then always change the mode.
+        # Some autopilots always change the mode after disarming. Such a change is no reaction to a failsafe.
         was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
         was_commanded = change.by_autopilot is False  # `by_autopilot` is None if the log does not contain the cause
         previous_mode = flight.mode_at(change.time_s - 1e-6)
         if is_near and was_armed and not was_commanded and previous_mode:
-            # If the log does not contain the cause, the autopilot is assumed to have made an immediate change. The
-            # pilot may have made a later one.
+            # If the log lacks the cause, an early change counts as the autopilot's. A later one may be the pilot's.
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
             cause = "" if is_sure else "; cause not logged"
             return _Reaction(_mode_change_text(change, previous_mode, time_s) + cause, is_sure)
@@ -232,7 +231,7 @@ def _mode_change_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> 
 def _disarming_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> _Reaction | None:
     time_s, until_s = group[0].time_s, group[-1].time_s + _DISARMING_TIMEOUT_S
     disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
-    # A span of `flight.armed` may also end with the log, without a disarming.
+    # A span of `flight.armed` that ends with the log does not end with a disarming.
     if disarmed_s is None or disarmed_s >= flight.duration_s:
         return None
     # Disarming counts as the autopilot's reaction only after evidence of a crash.

@@ -150,7 +150,7 @@ class _Tables:
         return [list(compress(column, kept)) for column in times_and_columns]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        # Rows have no checksum, so a time may be damaged. In a `TimeSeries`, no later row could have an earlier time.
+        # Rows have no checksum, so a time may be damaged. `TimeSeries.add` would pass a late one on to later rows.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time
@@ -328,7 +328,7 @@ class _Reader:
         for row in self._tables.rows("PSCE", "TPE", "TVE"):
             east.add(*row)
         for time, north_m, north_m_s in self._tables.rows("PSCN", "TPN", "TVN"):
-            # The rows of one set-point are logged together. One of them may be lost.
+            # A set-point has a row in PSCN and one in PSCE, with almost the same time. One of the two may be lost.
             east_m, east_m_s = (east.at(name, time + _SAME_SETPOINT_S, max_age_s=2 * _SAME_SETPOINT_S) for name in east)
             if plane is not None and not math.isnan(east_m):
                 latitude, longitude = plane.degrees(north_m, east_m)
@@ -341,7 +341,7 @@ class _Reader:
         has_positions = len(target) > 0
         relative = target["altitude_relative_m"]
         for time, height in heights:
-            # Positions and heights are logged at the same rate, so each height has a row.
+            # Positions and heights are logged at the same rate, so each height belongs to the latest position.
             if has_positions:
                 row = max(target.index_at(time), 0)
                 relative[row] = height

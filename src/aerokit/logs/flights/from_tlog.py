@@ -45,7 +45,7 @@ _MAX_DISORDER_S = 1.0
 _DOUBTFUL_JUMP_S = 3600.0
 # If no HEARTBEAT arrives for longer than this, the arming state is unknown.
 _MAX_HEARTBEAT_INTERVAL_S = 5.0
-# Older positions are not used to convert local set-points to global ones.
+# A local set-point is converted to a global one only with a position that is at most this old.
 _POSITION_MAX_AGE_S = 2.0
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
@@ -245,7 +245,7 @@ class _Reader:
         # logged the places of set-points.
         if setpoints.has("latitude_deg"):
             return
-        # Without places, any values are the heights of NAV_CONTROLLER_OUTPUT.
+        # NAV_CONTROLLER_OUTPUT may have logged heights without places. They are preferred to the destinations' heights.
         has_heights = setpoints.has()
         rows = list(_rows_of(setpoints))
         for time, latitude, longitude, amsl, relative in _rows_of(destinations):

@@ -18,10 +18,9 @@ _ALL_LOST = (100.0, 0)  # row of the link's time series: percentage of lost mess
 MIN_SILENCE_S = 3.0
 """Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 
-# If the clocks drift apart by more than _MAX_CLOCK_DRIFT (0.2 is 20 %), the vehicle is a simulation that did not run in
-# real time. In less than _MIN_CLOCK_COMPARISON_S, the delays of the link would distort the comparison. The comparison
-# treats an interval between two messages as long from _MAX_CLOCK_GAP_S on.
-_MAX_CLOCK_DRIFT, _MIN_CLOCK_COMPARISON_S, _MAX_CLOCK_GAP_S = 0.2, 1.0, 10.0
+_MAX_CLOCK_DRIFT = 0.2  # If the vehicle's clock is more than 20 % faster or slower, the vehicle is simulated.
+_MIN_CLOCK_COMPARISON_S = 1.0  # In a shorter recording, the delays of the link would distort the comparison.
+_MAX_CLOCK_GAP_S = 10.0  # `ClockComparison` sums longer intervals between two messages separately.
 
 
 class ClockComparison:
@@ -126,7 +125,7 @@ class LinkCounter:
         """Add a row for the counted second, and start to count ``second``."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        # In the seconds between `self._second` and `second`, no frames arrived. The first and the last get a row.
+        # No frames arrived after `self._second` and before `second`. The first and last of these seconds get a row.
         if second - self._second > 1:
             self._series.add(self._second + 1, *_ALL_LOST)
             self._series.add(second - 1, *_ALL_LOST)
@@ -148,7 +147,7 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
         f"this is a simulation at {format_value(speed)} times real speed, as the vehicle's clock shows: all times and"
         f" durations in this report are simulated; the recording took {recorded_s:.0f} s"
     )
-    # Speeds and turn rates stay as recorded, because the vehicle reports them per second of its own time.
+    # Speeds and turn rates are not converted, because the vehicle reports them per second of its own time.
     for series in _all_series(flight):
         for row, time_s in enumerate(series.times):
             series.times[row] = time_s * speed

@@ -211,6 +211,6 @@ class _VehicleStates:
             may_have_texts = True
         cells = telemetry.cells
         states = tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)
-        if may_have_texts:  # An incomplete text may be published together with the next text.
+        if may_have_texts:  # A STATUSTEXT can publish two texts: its own, and an earlier one whose rest is missing.
             states += tuple(("status_text", text) for text in telemetry.texts_since(now))
         return states

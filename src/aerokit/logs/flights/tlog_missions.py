@@ -103,7 +103,7 @@ class RecordedMission:
 
     def _store_item(self, message: m.MissionItemInt | m.MissionItem) -> None:
         scale = _DEGREES_E7 if isinstance(message, m.MissionItemInt) else 1.0
-        # In other frames, x and y are no degrees. Commands without a place use them for parameters 5 and 6.
+        # x and y are degrees only in a global frame, and only if the command has a place. 0, 0 means no place.
         has_position = message.frame in GLOBAL_FRAMES and has_place(message.command) and (message.x or message.y)
         self._items[message.seq] = Waypoint(
             number=message.seq,

@@ -63,7 +63,7 @@ class RecordedModeCommands:
         changes: list[ModeChange] = []
         for change in self._flight.modes:
             age_s = min(self._command_age_s(change, _ANY_MODE), self._command_age_s(change, change.name))
-            # The age is in recorded seconds, its maximum in the vehicle's seconds.
+            # `age_s` is in recorded seconds, _COMMAND_MAX_AGE_S in the vehicle's. In a fast simulation, they differ.
             is_commanded = age_s * speed < _COMMAND_MAX_AGE_S
             changes.append(change.replace(reason="ordered", by_autopilot=False) if is_commanded else change)
         self._flight.modes = changes

@@ -74,7 +74,7 @@ def write_report(
     if target_path.suffix.lower() not in (".html", ".htm"):
         raise InvalidArgument(f"target = {str(target_path)!r} is not allowed: the name of a report must end in .html")
     logs = [log] if compare_with is None else [log, compare_with]
-    # Check the logs before the target, because callers may derive its name from the log's.
+    # Check the logs before the target, because the default name of the target is derived from a log's.
     for path in logs:
         check_log_name(Path(path))
     if target_path.exists() and not force:

@@ -257,7 +257,7 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     if throttle is not None:
         advice = ", so look at motors, propellers and battery" if throttle.maximum >= _HIGH_THROTTLE_PERCENT else ""
         is_current_low = any(current.is_low for current in currents.values())
-        if throttle.is_low and not is_current_low:  # A low current gets the same advice below.
+        if throttle.is_low and not is_current_low:  # A low current gets this advice in its own text.
             advice = _STOPPED_MOTORS_ADVICE
         texts.append(f"throttle {throttle.text('%')}{advice}")
     tilt = _max_or_none([abs(angle) for name in angles for angle in flight.attitude.between(name, begin_s, end_s)])

@@ -43,7 +43,7 @@ def _passed_on(path: DisturbedHubPath) -> Iterator[str]:
     for passed in orders_in(path.at_vehicle.sent):
         what = f"{passed.message.NAME} at {passed.at:.2f}"
         if passed.raw[5:7] == VEHICLE_IDS:
-            continue  # The splitter gives both endpoints equal frames of the vehicle. It ignores its own ones.
+            continue  # The splitter passes the vehicle's own frames to both endpoints. The vehicle ignores them.
         if passed.raw not in written:
             yield f"{what} was not sent by the program"
             continue

@@ -109,7 +109,7 @@ async def _fly(case: FleetCase) -> list[str]:
             continue
         one.fresh_at = tuple(order_set.at for order_set in ordered if f"{name}/1" in order_set.orders)
         if one.fresh_at and case.policy != "hold_others":
-            # The policy's order continues, also when its call is cancelled.
+            # The policy's order continues even if the member's call is cancelled.
             one.error = AerokitError("the policy had another order for it")
         found += [f"{name}: {fault}" for fault in faults(one)]
     return found

@@ -241,7 +241,7 @@ ROWS = (
         lambda v: v.land_on(lambda: TargetMeasurement(0.1, 0.1, 5.0, is_level=True), timeout=60),
         SET_MODE,
         modes=((), ("PRECLAND",)),
-        on=("px4",),  # ArduPilot needs parameters
+        on=("px4",),  # ArduPilot needs PLND_ENABLED = 1.
     ),
     Row(
         "external.set_wind",

@@ -163,7 +163,7 @@ def test_late_arming_is_undone_after_other_stations_mode() -> None:
 
 def test_takeover_to_previous_mode_keeps_vehicle() -> None:
     """The pilot's mode before `go_to` and after its confirmed hold is the same."""
-    # Late enough that the latency has been measured: then the hold is not repeated before it is confirmed.
+    # By the time of the cancellation, the latency has been measured, so the hold is not repeated too early.
     disturbances = Disturbances(command=REPOSITION, lost_acks=9, lost_commands=1, latency_s=0.2)
     flown = fly(Case(BY_NAME["go_to from another mode"], "px4", disturbances, pilot_at=2.51, cancel_at=1.98))
     assert faults(flown) == []

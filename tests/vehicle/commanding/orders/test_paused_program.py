@@ -80,6 +80,6 @@ def test_blocked_program_keeps_failsafe(cases: list[tuple[str, str]]) -> None:
     for (scheme, what), (error, sent, oldest_s, reported, mode) in flown.items():
         where = f"{what} over {scheme}: {flown[scheme, what]}"
         assert error is not None, where
-        assert len(sent) == (what != "stream"), where  # Sent before the pause.
+        assert len(sent) == (what != "stream"), where  # The order was sent before the pause.
         assert oldest_s > PAUSE_S - 1.5, where  # the age of queued HEARTBEATs includes the pause
         assert reported == mode == RTL, where

@@ -129,7 +129,7 @@ class CheckedCalls:
     async def take_off(self) -> None:
         called_at, altitude_m = now(), self._rng.uniform(5, 20)
         await self._vehicle.take_off(altitude_m)
-        # During an earlier take-off, the vehicle may already be higher.
+        # If an earlier take-off is still in progress, the vehicle may be higher than `altitude_m`.
         errors_m = [self._height_error_m(state, altitude_m, called_at) for state in self.history.recent(called_at)]
         assert max(errors_m) > -1.5
 

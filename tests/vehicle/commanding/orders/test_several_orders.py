@@ -180,7 +180,7 @@ def _judge(
     is_against_the_pilot = takeover is not None and newest.at < takeover.at and sent.number > takeover.number
     own = [order.at for order in given if order.choice.name == "command"]
     if takeover is not None and own and takeover.at - own[-1] < MODE_GRACE_S:
-        return  # Any mode counts as its effect, see docs/reliability.md.
+        return  # Any mode change counts as an effect of the raw command (docs/reliability.md).
     assert kind == "set-point" or not is_against_the_pilot, f"after the pilot had taken over: {about}"
 
 
