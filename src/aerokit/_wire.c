@@ -17,7 +17,7 @@
 #include <string.h>
 #include <structmember.h>
 
-#define VERSION 1 /* must equal _VERSION in _internal/wire.py */
+#define VERSION 2 /* must equal _VERSION in _internal/wire.py */
 
 enum { MAGIC_V1 = 0xFE, MAGIC_V2 = 0xFD, SIGNED = 1, SIGNATURE = 13, HEADER = 9, MAX_PAYLOAD = 255, MAX_FRAME = 280 };
 
@@ -85,16 +85,12 @@ static int clear_all(PyObject **objects, int count) {
 /* ------------------------------------------------------------------------------------------- checksum */
 
 static void fill_crc_tables(State *state) {
-    for (int byte = 0; byte < 256; byte++) {
-        unsigned crc = (unsigned)byte;
-        for (int bit = 0; bit < 8; bit++)
-            crc = crc & 1 ? crc >> 1 ^ 0x8408 : crc >> 1;
-        state->crc[0][byte] = (uint16_t)crc;
-    }
-    for (int row = 1; row < 8; row++) /* entries for a byte that is followed by ``row`` zeros */
+    for (int row = 0; row < 8; row++) /* the entries of a byte that is followed by ``row`` zeros */
         for (int byte = 0; byte < 256; byte++) {
-            unsigned crc = state->crc[row - 1][byte];
-            state->crc[row][byte] = (uint16_t)(crc >> 8 ^ state->crc[0][crc & 0xFF]);
+            unsigned crc = (unsigned)byte;
+            for (int bit = 0; bit < 8 * (row + 1); bit++)
+                crc = crc & 1 ? crc >> 1 ^ 0x8408 : crc >> 1;
+            state->crc[row][byte] = (uint16_t)crc;
         }
 }
 
@@ -136,13 +132,39 @@ typedef struct {
 } Frame;
 
 #define MEMBER(name, kind, Type, member) {name, kind, offsetof(Type, member), 0, NULL}
-
 static PyMemberDef frame_members[] = {
-    MEMBER("body", T_OBJECT_EX, Frame, body),        MEMBER("received_at", T_OBJECT_EX, Frame, received_at),
+    MEMBER("_body", T_OBJECT_EX, Frame, body),       MEMBER("received_at", T_OBJECT_EX, Frame, received_at),
     MEMBER("_raw", T_OBJECT_EX, Frame, raw),         MEMBER("message_id", T_UINT, Frame, message_id),
     MEMBER("checksum", T_USHORT, Frame, checksum),   MEMBER("system_id", T_UBYTE, Frame, system_id),
     MEMBER("component_id", T_UBYTE, Frame, component_id), {0},
 };
+
+/* Find the payload in `_raw`. Return its length, or -1 if `_raw` does not contain a whole frame. */
+static int find_payload(const Frame *frame, const uint8_t **payload) {
+    if (frame->raw == NULL || !PyBytes_CheckExact(frame->raw))
+        return -1;
+    const uint8_t *raw = (const uint8_t *)PyBytes_AsString(frame->raw); /* a zero byte follows the last one */
+    Py_ssize_t size = PyBytes_Size(frame->raw), header = raw[0] == MAGIC_V1 ? 6 : 10;
+    *payload = raw + header;
+    return size > header && size >= header + raw[1] + 2 ? raw[1] : -1;
+}
+
+/* Return `Frame.body`. It is created when it is first read, because most frames are only decoded. */
+static PyObject *frame_body(PyObject *object, void *closure) {
+    Frame *frame = (Frame *)object;
+    const uint8_t *payload;
+    int length = frame->body == NULL ? find_payload(frame, &payload) : -1;
+    if (length >= 0) {
+        const uint8_t *raw = (const uint8_t *)PyBytes_AsString(frame->raw);
+        uint8_t body_v1[HEADER + MAX_PAYLOAD] = {raw[1], 0, 0, raw[2], raw[3], raw[4], raw[5], 0, 0};
+        memcpy(body_v1 + HEADER, payload, (size_t)length);
+        frame->body = PyBytes_FromStringAndSize((char *)(raw[0] == MAGIC_V1 ? body_v1 : raw + 1), HEADER + length);
+    }
+    Py_XINCREF(frame->body);
+    return frame->body != NULL || PyErr_Occurred() ? frame->body : PyErr_Format(PyExc_AttributeError, "body");
+}
+
+static PyGetSetDef frame_getters[] = {{"body", frame_body, NULL, NULL, NULL}, {0}};
 
 static void frame_dealloc(PyObject *self) {
     clear_all(&((Frame *)self)->body, 3);
@@ -154,26 +176,14 @@ static PyObject *make_frame(State *state, const uint8_t *raw, Py_ssize_t size, P
     Frame *frame = (Frame *)PyType_GenericAlloc(state->classes[FRAME], 0);
     if (frame == NULL)
         return NULL;
-    int is_v1 = raw[0] == MAGIC_V1, length = raw[1];
+    int is_v1 = raw[0] == MAGIC_V1;
     frame->message_id = message_id_of(raw);
-    frame->checksum = (unsigned short)u16(raw + (is_v1 ? 6 : 10) + length);
+    frame->checksum = (unsigned short)u16(raw + (is_v1 ? 6 : 10) + raw[1]);
     frame->system_id = raw[is_v1 ? 3 : 5];
     frame->component_id = raw[is_v1 ? 4 : 6];
     frame->received_at = new_reference(received_at);
-    frame->body = PyBytes_FromStringAndSize(is_v1 ? NULL : (const char *)raw + 1, HEADER + length);
-    if (is_v1 && frame->body != NULL) {
-        uint8_t *body = (uint8_t *)PyBytes_AsString(frame->body);
-        const uint8_t header[HEADER] = {raw[1], 0, 0, raw[2], raw[3], raw[4], raw[5], 0, 0};
-        memcpy(body, header, HEADER);
-        memcpy(body + HEADER, raw + 6, (size_t)length);
-    }
-    if (is_v1 || raw[2]) { /* `Frame.raw` cannot reconstruct MAVLink 1 frames and signed frames */
-        Py_XINCREF(whole);
-        frame->raw = whole != NULL ? whole : PyBytes_FromStringAndSize((const char *)raw, size);
-        if (frame->raw == NULL)
-            Py_CLEAR(frame->body);
-    }
-    if (frame->body == NULL) {
+    frame->raw = whole != NULL ? new_reference(whole) : PyBytes_FromStringAndSize((const char *)raw, size);
+    if (frame->raw == NULL) {
         Py_DECREF(frame);
         return NULL;
     }
@@ -202,7 +212,7 @@ typedef struct {
 static PyMemberDef source_members[] = {MEMBER("expected", T_ULONGLONG, Number, number), {0}};
 static PyMemberDef counter_members[] = {MEMBER("bytes", T_ULONGLONG, Number, number), {0}};
 
-/* -------------------------------------------------------------------------- layouts of message classes */
+/* ------------------------------------------------------------- layouts of message classes, and decoding */
 
 typedef struct {
     int kind;        /* "s" for a text, "p" for bytes, otherwise the code in Python's struct */
@@ -217,6 +227,7 @@ typedef struct {
     Py_ssize_t frame_slot;
     Field *memory; /* the fields in wire order */
     int field_count, id, crc_extra, length, base_length;
+    State *state; /* state of the module, which the type keeps alive */
 } Layout;
 
 static PyObject **at_slot(PyObject *object, Py_ssize_t slot) { return (PyObject **)(void *)((char *)object + slot); }
@@ -283,6 +294,7 @@ static PyObject *wire_layout(PyObject *module, PyObject *args) {
     if (self != NULL && PyArg_ParseTuple(args, "O!iiiiO!", &PyType_Type, &message_class, &self->id, &self->crc_extra,
                                          &self->length, &self->base_length, &PyTuple_Type, &rows)) {
         self->message_class = new_reference(message_class);
+        self->state = state;
         result = fill_layout(self, rows);
     }
     if (result > 0)
@@ -291,15 +303,11 @@ static PyObject *wire_layout(PyObject *module, PyObject *args) {
     return result < 0 ? NULL : new_reference(Py_None);
 }
 
-/* ------------------------------------------------------------------------------------------- decoding */
-
 typedef union { float number; uint32_t bits; } Single;
 typedef union { double number; uint64_t bits; } Double;
 
 /* Return the number at ``at``; NULL without an exception for a signalling NaN, because Python versions differ there. */
 static PyObject *decode_number(int kind, const uint8_t *at) {
-    Single single;
-    int is_signalling;
     switch (kind) {
     case 'b': return PyLong_FromLong((int8_t)at[0]);
     case 'B': return PyLong_FromLong(at[0]);
@@ -310,9 +318,9 @@ static PyObject *decode_number(int kind, const uint8_t *at) {
     case 'q': return PyLong_FromLongLong((int64_t)u64(at));
     case 'Q': return PyLong_FromUnsignedLongLong(u64(at));
     case 'f':
-        single.bits = u32(at);
-        is_signalling = (single.bits & 0x7FC00000) == 0x7F800000 && single.bits & 0x3FFFFF;
-        return is_signalling ? NULL : PyFloat_FromDouble(single.number);
+        if ((u32(at) & 0x7FC00000) == 0x7F800000 && u32(at) & 0x3FFFFF)
+            return NULL;
+        return PyFloat_FromDouble((Single){.bits = u32(at)}.number);
     default: return PyFloat_FromDouble((Double){.bits = u64(at)}.number);
     }
 }
@@ -339,42 +347,39 @@ static PyObject *decode_field(const Field *field, const uint8_t *payload) {
     return items;
 }
 
-/* Decode a `Frame.body`: a header of nine bytes, then the payload. The caller must own references to both arguments. */
-static PyObject *decode_body(Layout *self, PyObject *body, PyObject *frame) {
-    PyObject *message = NULL, *value;
-    if (!PyBytes_CheckExact(body) || self->message_class == NULL)
-        goto python;
-    const uint8_t *payload = (const uint8_t *)PyBytes_AsString(body) + HEADER;
-    Py_ssize_t size = PyBytes_Size(body) - HEADER;
+/* decode(frame): decode a frame of this class. Frames without `_raw` and invalid values are left to Python code. */
+static PyObject *layout_decode(PyObject *object, PyObject *frame) {
+    Layout *self = (Layout *)object;
+    const uint8_t *payload;
     uint8_t restored[MAX_PAYLOAD];
+    PyObject *message = NULL, *raw = NULL, *value;
+    int size = Py_TYPE(frame) == self->state->classes[FRAME] ? find_payload((Frame *)frame, &payload) : -1;
+    if (size < 0 || self->message_class == NULL)
+        goto python;
     if (size < self->length) { /* the sender truncated trailing zeros */
         memset(restored, 0, (size_t)self->length);
-        if (size > 0)
-            memcpy(restored, payload, (size_t)size);
+        memcpy(restored, payload, (size_t)size);
         payload = restored;
     }
     message = PyType_GenericAlloc((PyTypeObject *)self->message_class, 0);
     if (message == NULL)
         return NULL;
+    raw = new_reference(((Frame *)frame)->raw); /* keeps the payload alive */
     *at_slot(message, self->frame_slot) = new_reference(frame);
     for (int i = 0; i < self->field_count; i++) {
         value = *at_slot(message, self->memory[i].slot) = decode_field(&self->memory[i], payload);
         if (value == NULL)
             goto python;
     }
+    Py_DECREF(raw);
     return message;
 python:
     Py_XDECREF(message);
+    Py_XDECREF(raw);
     if (PyErr_Occurred() || self->message_class == NULL) /* the class is NULL while the layout is being destroyed */
         return PyErr_Occurred() ? NULL : PyErr_NoMemory();
-    return PyObject_CallMethod(self->message_class, "decode_body", "OO", body, frame);
-}
-
-/* decode(body, frame): implements `Message.decode_body` of the class. */
-static PyObject *layout_decode(PyObject *self, PyObject *const *args, Py_ssize_t count) {
-    if (count == 1 || count == 2)
-        return decode_body((Layout *)self, args[0], count == 2 ? args[1] : Py_None);
-    return PyErr_Format(PyExc_TypeError, "decode() takes body and frame, not %zd arguments", count);
+    value = PyObject_GetAttrString(frame, "body");
+    return value == NULL ? NULL : PyObject_CallMethod(self->message_class, "decode_body", "NO", value, frame);
 }
 
 /* ------------------------------------------------------------------------------------------- encoding */
@@ -572,13 +577,9 @@ static PyObject *table_decode(PyObject *object, PyObject *frame) {
         if (result < 0)
             return NULL;
     }
-    PyObject *body = row == NULL ? NULL : ((Frame *)frame)->body;
-    if (body == NULL || Py_TYPE(row->layout) != self->state->types[LAYOUT])
-        return PyObject_CallFunctionObjArgs(self->decode_in_python, frame, NULL);
-    Py_INCREF(body);
-    PyObject *message = decode_body((Layout *)row->layout, body, frame);
-    Py_DECREF(body);
-    return message;
+    return row != NULL && Py_TYPE(row->layout) == self->state->types[LAYOUT]
+               ? layout_decode(row->layout, frame)
+               : PyObject_CallFunctionObjArgs(self->decode_in_python, frame, NULL);
 }
 
 /* -------------------------------------------------------------------------------------------- framing */
@@ -595,7 +596,6 @@ typedef struct {
 } Framer;
 
 #define OBJECT(name, member) MEMBER(name, T_OBJECT_EX, Framer, member)
-
 static PyMemberDef framer_members[] = {
     OBJECT("wanted", wanted),   OBJECT("statistics", statistics), OBJECT("_rest", rest),
     OBJECT("_sources", sources), OBJECT("_table", table), {0},
@@ -749,8 +749,7 @@ static int begin_run(Run *run, PyObject *data) {
     run->sources = new_reference(self->sources);
     run->table = new_reference(self->table);
     run->frames = PyList_New(0);
-    run->data = PyBytes_CheckExact(data) ? new_reference(data)
-                                         : PyObject_CallFunctionObjArgs((PyObject *)&PyBytes_Type, data, NULL);
+    run->data = PyBytes_FromObject(data);
     if (run->frames == NULL || run->data == NULL)
         return -1;
     ((Number *)self->statistics)->number += (unsigned long long)PyBytes_Size(run->data);
@@ -839,7 +838,7 @@ static PyObject *wire_tlog_records(PyObject *module, PyObject *args) {
 
 #define METHOD(name, function, flags) {name, (PyCFunction)(void (*)(void))function, flags, NULL}
 
-static PyMethodDef layout_methods[] = {METHOD("decode", layout_decode, METH_FASTCALL), {0}};
+static PyMethodDef layout_methods[] = {METHOD("decode", layout_decode, METH_O), {0}};
 static PyMethodDef table_methods[] = {METHOD("decode", table_decode, METH_O), {0}};
 static PyMethodDef framer_methods[] = {
     METHOD("receive", framer_receive, METH_METHOD | METH_FASTCALL | METH_KEYWORDS), {0}};
@@ -856,7 +855,8 @@ static PyMethodDef functions[] = {
     {Py_tp_traverse, name##_traverse}, {Py_tp_clear, name##_clear}, {Py_tp_dealloc, name##_dealloc},                   \
     {Py_tp_methods, name##_methods}
 
-static PyType_Slot frame_slots[] = {{Py_tp_members, frame_members}, {Py_tp_dealloc, frame_dealloc}, {0}};
+static PyType_Slot frame_slots[] = {
+    {Py_tp_members, frame_members}, {Py_tp_getset, frame_getters}, {Py_tp_dealloc, frame_dealloc}, {0}};
 static PyType_Slot source_slots[] = {{Py_tp_members, source_members}, {Py_tp_dealloc, free_object}, {0}};
 static PyType_Slot counter_slots[] = {{Py_tp_members, counter_members}, {Py_tp_dealloc, free_object}, {0}};
 static PyType_Slot layout_slots[] = {GC_SLOTS(layout), {0}};

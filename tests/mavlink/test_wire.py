@@ -52,14 +52,16 @@ def test_all_messages_decode_and_encode_the_same() -> None:
             assert type(decoded) is message_class
             assert decoded.received_frame is frame
             assert exact(decoded) == exact(message_class.decode_body(frame.body, frame))
-            assert exact(decoder_of(message_class)(frame.body, frame)) == exact(decoded)
+            assert exact(decoder_of(message_class)(frame)) == exact(decoded)
 
 
 @compiled
-@given(st.sampled_from(sorted(STANDARD.rows)), st.binary(max_size=300))
-def test_any_payload_decodes_the_same(message_id: int, payload: bytes) -> None:
-    frame = Frame()
-    frame.body, frame.message_id = bytes(9) + payload, message_id
+@given(st.sampled_from(sorted(STANDARD.rows)), st.binary(max_size=255), st.booleans())
+def test_any_payload_decodes_the_same(message_id: int, payload: bytes, has_only_body: bool) -> None:
+    header = bytes((len(payload), 0, 0, 7, 1, 1)) + message_id.to_bytes(3, "little")
+    frame = Frame.parse(b"\xfd" + header + payload + b"\1\2")
+    if has_only_body:  # like a frame of PythonFramer
+        del frame._raw
     expected = STANDARD[message_id].decode_body(frame.body, frame)
     decoded = STANDARD.decode(frame)
     assert exact(decoded) == exact(expected)
@@ -117,8 +119,7 @@ def test_subclass_of_message_keeps_its_own_methods() -> None:
 
 
 def test_unknown_message_raises_key_error() -> None:
-    frame = Frame()
-    frame.body, frame.message_id = bytes(9), 16_000_000
+    frame = Frame.parse(b"\xfd" + bytes(6) + (16_000_000).to_bytes(3, "little") + bytes(2))
     with pytest.raises(KeyError):
         STANDARD.decode(frame)
 
@@ -168,6 +169,20 @@ def test_framer_and_dialect_are_freed() -> None:
     del framer, dialect, frame
     gc.collect()
     assert [reference() for reference in gone] == [None, None]
+
+
+@compiled
+@pytest.mark.parametrize("raw", [b"", b"\xfd", b"\xfe\xff" + bytes(20), b"\xfd\1" + bytes(10), bytearray(21), None])
+def test_frame_of_incomplete_data_has_no_body(raw: Any) -> None:
+    frame = Frame()
+    frame.message_id = messages.Heartbeat.ID
+    for decode in (STANDARD.decode, decoder_of(messages.Heartbeat)):
+        frame._raw = raw
+        with pytest.raises(AttributeError, match="body"):
+            decode(frame)
+        del frame._raw
+        with pytest.raises(AttributeError, match="body"):
+            decode(frame)
 
 
 @compiled

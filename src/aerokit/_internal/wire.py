@@ -11,7 +11,7 @@ from importlib import import_module
 from types import MemberDescriptorType
 from typing import TYPE_CHECKING, Any
 
-_VERSION = 1  # Must equal VERSION in _wire.c, so that an outdated build of the extension is not used.
+_VERSION = 2  # Must equal VERSION in _wire.c, so that an outdated build of the extension is not used.
 
 
 def _load() -> Any:
@@ -34,7 +34,11 @@ wire_implementation: str = "python" if wire is None else "c"
 
 # Without the compiled extension, these classes define the slots of frames, of their sources and of counters.
 class _FrameFields:
-    __slots__ = ("_raw", "body", "checksum", "component_id", "message_id", "received_at", "system_id")
+    __slots__ = ("_body", "_raw", "checksum", "component_id", "message_id", "received_at", "system_id")
+
+
+# The compiled `body` is computed from `_raw` when it is first read. The framer in Python sets `_body` of each frame.
+_FrameFields.body = _FrameFields._body  # type: ignore[attr-defined]
 
 
 class _SourceFields:

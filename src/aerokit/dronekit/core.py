@@ -96,7 +96,7 @@ class LatestMessage(Generic[MessageT]):
     """
 
     def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
-        self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
+        self._decode: Callable[[Frame], MessageT] = decoder_of(message_type)
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
         self._notified_names: set[str] = set()  # attributes whose listeners the handlers notify
@@ -116,7 +116,7 @@ class LatestMessage(Generic[MessageT]):
             return latest
         decoded = self._decoded
         if decoded is None or decoded.received_frame is not latest:
-            decoded = self._decoded = self._decode(latest.body, latest)
+            decoded = self._decoded = self._decode(latest)
         return decoded
 
     def values(self, *fields: str) -> tuple[Any, ...]:
@@ -135,7 +135,7 @@ class LatestMessage(Generic[MessageT]):
         if frame.component_id != self.component_id:
             return
         if self._must_decode():
-            self.receive(self._decode(frame.body, frame) if message is None else message)
+            self.receive(self._decode(frame) if message is None else message)
         else:
             self._latest = frame
 

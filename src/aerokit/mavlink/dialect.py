@@ -16,7 +16,7 @@ import aerokit.mavlink.enums as enums
 import aerokit.mavlink.messages as messages
 from aerokit._internal.wire import wire
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.message import Message, decoder_of, layout_of, make_enum
+from aerokit.mavlink.message import Message, layout_of, make_enum
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -118,7 +118,7 @@ class Dialect:
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
         # Replace this function by the class's decoder, so that `decode` need not check whether the class is loaded.
-        decoder = self._decoders[message_id] = decoder_of(self[message_id])
+        decoder = self._decoders[message_id] = self[message_id].decode_body
         return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:

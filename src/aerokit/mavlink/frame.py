@@ -41,7 +41,9 @@ class Frame(FrameFields):
     """System id of the sender, 0..255 (0 is invalid)."""
     component_id: int
     """Component id of the sender, 0..255."""
-    _raw: bytes  # set only if `raw` cannot be computed: for MAVLink 1, signed frames and frames of `Frame.parse`
+    # At least one of these is set. `raw` or `body` computes the other: MAVLink 1 and signed frames have `_raw`.
+    _body: bytes
+    _raw: bytes
     received_at: float
     """Time in seconds that was passed to the framer with the data."""
 
@@ -51,16 +53,17 @@ class Frame(FrameFields):
         frame = cls()
         frame._raw = raw
         frame.received_at = received_at
-        magic, payload_length = raw[:2]
-        payload_end = payload_length + (6 if magic == MAGIC_V1 else 10)
-        frame.checksum = int.from_bytes(raw[payload_end : payload_end + 2], "little")
-        if magic == MAGIC_V1:
+        if raw[0] == MAGIC_V1:
+            length, _, frame.system_id, frame.component_id, frame.message_id = raw[1:6]
+            payload_end = 6 + length
             # `body` always has the header layout of MAVLink 2: the flags and the upper bytes of the message id are 0.
-            frame.body = bytes((payload_length, 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
+            frame._body = bytes((length, 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
         else:
-            frame.body = raw[1:payload_end]
-        frame.system_id, frame.component_id = frame.body[4:6]
-        frame.message_id = int.from_bytes(frame.body[6:9], "little")
+            payload_end = 10 + raw[1]
+            frame.system_id, frame.component_id = raw[5], raw[6]
+            frame.message_id = raw[7] | raw[8] << 8 | raw[9] << 16
+            frame._body = raw[1:payload_end]
+        frame.checksum = int.from_bytes(raw[payload_end : payload_end + 2], "little")
         return frame
 
     @property

@@ -132,7 +132,7 @@ class PythonFramer:
                         if self.wanted is not None and message_id not in self.wanted:
                             return []
                         frame = Frame()
-                        frame.body = body
+                        frame._body = body
                         frame.checksum = checksum
                         frame.message_id = message_id
                         frame.system_id = source.system_id
@@ -195,7 +195,7 @@ class PythonFramer:
             if wanted is None or message_id in wanted:
                 if is_valid:
                     frame = Frame()
-                    frame.body = body
+                    frame._body = body
                     frame.checksum = checksum
                     frame.message_id = message_id
                     frame.system_id = source.system_id

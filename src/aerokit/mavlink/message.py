@@ -181,10 +181,12 @@ def _wire_code(field: Field) -> str:
     return "p" if is_bytes else STRUCT_CODES[field.type]
 
 
-def decoder_of(message_type: type[MessageT]) -> Callable[[bytes, Frame | None], MessageT]:
-    """Return the compiled decoder of this class or, without one, its `Message.decode_body`."""
+def decoder_of(message_type: type[MessageT]) -> Callable[[Frame], MessageT]:
+    """Return a function that decodes frames of this class, compiled if possible."""
     layout = layout_of(message_type)
-    decode: Callable[[bytes, Frame | None], MessageT] = message_type.decode_body if layout is None else layout.decode
+    if layout is None:
+        return lambda frame: message_type.decode_body(frame.body, frame)
+    decode: Callable[[Frame], MessageT] = layout.decode
     return decode
 
 

@@ -516,17 +516,7 @@ def _message_id_bytes(kind: type[Message]) -> bytes:
 
 def _decode_frame(raw: bytes, unix_s: float) -> Message | None:
     """Decode the frame of a record; None if its checksum is wrong."""
-    if raw[0] == MAGIC_V2:
-        # Setting the attributes is faster than `Frame.parse`. A signature after the checksum is ignored.
-        frame = Frame()
-        end = 10 + raw[1]  # the end of the payload
-        frame.body = raw[1:end]
-        frame.checksum = raw[end] | raw[end + 1] << 8
-        frame.system_id, frame.component_id = raw[5], raw[6]
-        frame.message_id = raw[7] | raw[8] << 8 | raw[9] << 16
-        frame.received_at = unix_s
-    else:
-        frame = Frame.parse(raw, unix_s)
+    frame = Frame.parse(raw, unix_s)
     if x25(frame.body + STANDARD.extras[frame.message_id]) != frame.checksum:
         return None
     return STANDARD.decode(frame)

@@ -264,7 +264,7 @@ class Telemetry(States):
         decode = decoder_of(message_class)
 
         def apply(frame: Frame, message: Message | None) -> None:
-            decoded = decode(frame.body, frame) if message is None else message
+            decoded = decode(frame) if message is None else message
             self._handle(handler, decoded, source, frame)
 
         fields_and_sources = SOURCES[class_name]
