@@ -218,7 +218,7 @@ class Autopilot:
     can_shut_down = False
     """True if MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN (246) can switch the autopilot off."""
     condition_yaw = False
-    """True if MAV_CMD_CONDITION_YAW (115) turns the vehicle in its set-point mode."""
+    """True if MAV_CMD_CONDITION_YAW (115) turns the vehicle in its mode for set-points (GUIDED, OFFBOARD)."""
     reposition_purpose: Purpose = "setpoint"
     """Purpose of the mode that DO_REPOSITION changes to."""
     lands_after_return = False

@@ -161,7 +161,7 @@ class Routes:
     ) -> None:
         self._link, self._publish, self._vehicle_systems = link, publish, vehicle_systems
         self._boot_clocks = {} if boot_clocks is None else boot_clocks
-        self._may_move = may_move  # True if a silent system may move to any host
+        self._may_move = may_move  # True if a silent system may continue at an address of another host
         self._routes: dict[ComponentId, _Route] = {}
         self._other_peers: dict[tuple[ComponentId, Peer], OtherPeer] = {}
         self._swept_at = 0.0  # time of the last removal of expired routes

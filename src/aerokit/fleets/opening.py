@@ -210,7 +210,7 @@ def _check_names(members: list[Member]) -> None:
 
 
 def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
-    """Set ``attribute`` (``group`` or ``role``) of the members that match the patterns of each name."""
+    """Set ``attribute`` (``group`` or ``role``) to each name, for the members that match its patterns."""
     for name, one_or_more in patterns_by_name.items():
         patterns = [one_or_more] if isinstance(one_or_more, str) else one_or_more
         for member_name in context.matching(*patterns):

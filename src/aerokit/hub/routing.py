@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 PortT = TypeVar("PortT")
 
 MAX_PLANS = 4096
-"""Maximum number of cached plans per port."""
+"""Maximum number of cached routing plans per port."""
 
 _HEARTBEAT = 0
 _SETUP_SIGNING = 256

@@ -28,7 +28,7 @@ class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
     # For speed, there is no constructor: the framer sets the attributes directly. Properties compute all other values.
-    if not TYPE_CHECKING:  # Type checkers see the attributes of the base class.
+    if not TYPE_CHECKING:  # Type checkers would reject the annotations below, which empty slots do not contain.
         __slots__ = ()
 
     body: bytes

@@ -55,11 +55,11 @@ class AutopilotDriver:
         raise NotImplementedError
 
     async def reboot(self) -> None:
-        """Restart the vehicle's computer."""
+        """Restart the flight controller."""
         raise NotImplementedError
 
     async def shutdown(self) -> None:
-        """Switch the vehicle's computer off."""
+        """Switch the flight controller off."""
         raise NotImplementedError
 
     async def terminate(self) -> None:

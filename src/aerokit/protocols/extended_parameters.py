@@ -103,7 +103,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._last_at = now
             timeout_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
             self._stream_deadline = now + min(timeout_s, MAX_STREAM_TIMEOUT_S)
-            self._window.discard(index)  # A streamed value does not measure the round trip.
+            self._window.discard(index)  # Only values that were requested one by one measure the round trip.
         else:
             self._window.on_answer(index, now)
         self._store(index, setting, count, now)

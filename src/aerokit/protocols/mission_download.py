@@ -165,7 +165,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         elif result not in (
             MavMissionResult.ACCEPTED,
             MavMissionResult.INVALID_SEQUENCE,  # A MISSION_COUNT with the new number of items follows.
-            MavMissionResult.OPERATION_CANCELLED,  # This ends an earlier upload, not this download.
+            MavMissionResult.OPERATION_CANCELLED,  # The vehicle acknowledges the end of an earlier upload.
         ):
             self._reject(result)
 

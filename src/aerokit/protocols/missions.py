@@ -247,12 +247,12 @@ class SetCurrentItem(Transfer[None]):
         status = self._order_status
         end_reason = "" if status is None else status.end
         min_heartbeat_at = max(self._sent_at, now - MAX_HEARTBEAT_AGE_S)
-        if end_reason or self._is_idle(now):
+        if end_reason or self._is_idle(now):  # The order is no longer valid, or was not confirmed in time.
             reported = "nothing" if self._reported is None else f"item {self._reported}"
             self._fail(
                 OperationTimeout(
                     f"MISSION_SET_CURRENT {self._seq} was not confirmed in {now - self._started_at:.1f} s"
-                    f" ({self._attempts} attempts); MISSION_CURRENT reported {reported} (numbers as in the messages)"
+                    f" ({self._attempts} attempts); MISSION_CURRENT reported {reported} (items are numbered from 0)"
                     + (f"; not sent again: {end_reason}" if end_reason else "")
                 )
             )

@@ -456,14 +456,14 @@ async def test_zero_rates_end_after_pause_of_program(pause: str) -> None:
 
 async def test_rates_after_zero_rate_end_despite_lost_message() -> None:
     """A rate arrives after the acknowledged command with the rate of zero, and the next two messages are lost."""
-    gimbal, final_message = SimulatedGimbal(), anyio.Event()
+    gimbal, stop_message = SimulatedGimbal(), anyio.Event()
     async with with_gimbals(gimbal) as flight, flight.vehicle.gimbal.control():
         with suppress(Boom):
             async with flight.vehicle.gimbal.rates(-5.0, 10.0):
                 await anyio.sleep(0.5)
-                flight.copter.observe(m.GimbalManagerSetPitchyaw, lambda *_: final_message.set())
+                flight.copter.observe(m.GimbalManagerSetPitchyaw, lambda *_: stop_message.set())
                 raise Boom
-        await final_message.wait()
+        await stop_message.wait()
         late, *_ = flight.wire.all(m.GimbalManagerSetPitchyaw)
         flight.copter.receive(FrameEncoder(*own_ids(flight)).encode(late), flight.copter.now)
         gimbal.faults.drop_incoming = 2

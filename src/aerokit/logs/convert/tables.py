@@ -165,7 +165,7 @@ Table = CsvTable | ParquetTable
 _AddRow = Callable[[float, Sequence[Any]], None]
 """Adds a row to a table: its time, and the values of its other columns."""
 _MakeRow = Callable[["LogRecord"], Sequence[Any]]
-"""Returns the values of all columns but the time for a record."""
+"""Converts a log record to a row: the values of all columns except the time."""
 
 
 class FlightTableWriter:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.movement import Attitude, Velocity
 
 MAP_FRAME = "map"
-"""Common frame of all vehicles: x is east, y north, z up, in metres. The origin is as for `MapFrame`."""
+"""Common frame of all vehicles: x is east, y north, z up, in metres. `MapFrame` chooses the origin."""
 _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 _NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
 _JSON_TYPES = {"float": "number", "int": "number", "str": "string", "bool": "boolean"}

@@ -245,7 +245,8 @@ class _Reader:
         # logged the places of set-points.
         if setpoints.has("latitude_deg"):
             return
-        # NAV_CONTROLLER_OUTPUT may have logged heights without places. They are preferred to the destinations' heights.
+        # The rows of `setpoints` without places have heights from NAV_CONTROLLER_OUTPUT. If there are any, the heights
+        # from POSITION_TARGET_GLOBAL_INT are not used.
         has_heights = setpoints.has()
         rows = list(_rows_of(setpoints))
         for time, latitude, longitude, amsl, relative in _rows_of(destinations):

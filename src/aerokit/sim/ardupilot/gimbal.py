@@ -146,7 +146,7 @@ class ArduPilotGimbal:
 
     def point(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
         """Turn to these angles in degrees."""
-        if not from_north:  # A yaw from north is limited later, in `angles`.
+        if not from_north:  # `angles` limits a yaw that is relative to north.
             yaw = self._limited("YAW", yaw - 360.0 if yaw > 180.0 else yaw)
         self._target = MountTarget(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
         self.mode = MavMountMode.MAVLINK_TARGETING

@@ -117,7 +117,7 @@ class CommandList(ItemList):
         if seq > count or not has_space:
             return MavMissionResult.ERROR
         if seq == count:
-            # If the list is empty, the firmware adds home first. Item 0 then becomes item 1 (AP_Mission.cpp, add_cmd).
+            # If the list is empty, the firmware adds home first, so this item becomes item 1 (AP_Mission.cpp, add_cmd).
             self.add_home()
             self._commands.append(stored_item)
         elif seq != _HOME_SEQ:  # Item 0 is home, which is not stored.

@@ -57,9 +57,9 @@ class _Sensors:
     working: int
     """Bits that are present, enabled and healthy from power-on."""
     control: int = _ALL_CONTROL
-    """Kinds of control that the firmware supports."""
+    """Bits of the kinds of control that the firmware supports, such as MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL."""
     always: int = 0
-    """Kinds of control that are enabled in every mode."""
+    """Bits of the kinds of control that are enabled in every mode."""
     only_healthy: int = 0
     """Bits that are healthy, but neither present nor enabled."""
     unhealthy: int = 0

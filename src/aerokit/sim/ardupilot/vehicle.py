@@ -254,7 +254,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
-        # SITL leaves its boot state about half a second later.
+        # SITL is still in MAV_STATE_BOOT for about half a second after these texts.
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:

@@ -94,7 +94,7 @@ class SimulatedCamera(CameraBody):
     - ``streams``: addresses of video streams, such as ``rtsp://192.168.0.10:8554/main``; no video is sent
     - ``thermal_celsius``: lowest and highest temperature in the image of a thermal camera; None for a visible-light
       camera. The last stream of a thermal camera is the thermal stream.
-    - ``picture``: content of image files (JPEG), or a function of the capture that returns it; the files are in
+    - ``picture``: content of image files (JPEG), or a function that returns it for a `Capture`; the files are in
       ``/DCIM`` and served by MAVFTP
     - ``gimbal``: the gimbal that carries the camera and determines the direction of images
     - ``capacity_mib``, ``image_mib``, ``video_mib_s``: size of the card, of an image, of a second of video

@@ -125,9 +125,9 @@ class CommandArbiter:
         self._set_latest(self._new_order(), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
-        """Create an order about a device. It supersedes the previous order about this device.
+        """Create an order to a device, such as a gripper. The previous order to this device is no longer valid.
 
-        With ``may_be_withdrawn``, withdrawing the new order makes the previous one valid again.
+        With ``may_be_withdrawn``, `Order.withdraw` of the new order makes the previous one valid again.
         """
         order = self._new_order(ending_topics=(topic,))
         order.previous = self.latest(topic) if may_be_withdrawn else None

@@ -123,7 +123,7 @@ class PathSetpoints:
             self.is_on_path = True
             self._flown_m = length_m
             self._present_speed_m_s = 0.0
-        # The unit vector towards the path; zero if the set-point begins there.
+        # The unit vector towards the path; zero if the set-point begins on the path.
         to_north, to_east, to_down = (component / length_m if length_m else 0.0 for component in to_path)
         flown_m, speed = self._flown_m, self._present_speed_m_s
         place = (start_north + flown_m * to_north, start_east + flown_m * to_east)

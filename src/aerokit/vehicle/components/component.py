@@ -51,9 +51,9 @@ class ComponentStatus(Snapshot):
     """One component of the vehicle's system.
 
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
-    MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. ``device_id`` is 1 to 6 for a camera or gimbal without
-    its own component id, otherwise 0. The ``component_id`` of such a device is that of the component to which it is
-    attached. ``received_at`` is the time of the component's last message on the event loop's clock.
+    MAV_TYPE in lower case or, for MAV_TYPE_GENERIC, MAV_COMPONENT. ``device_id`` is 1 to 6 for a camera or gimbal that
+    has no component id of its own, otherwise 0. The ``component_id`` of such a device is that of the component to which
+    it is attached. ``received_at`` is the time of the component's last message on the event loop's clock.
     """
 
     component_id: int

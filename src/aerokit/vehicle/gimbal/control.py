@@ -36,7 +36,7 @@ __all__ = ["GimbalControl"]
 
 RELEASE_ATTEMPTS, ATTEMPT_TIMEOUT_S = 10, 0.5
 # A message has no acknowledgement, so it is repeated.
-FINAL_MESSAGE_COUNT, FINAL_MESSAGE_INTERVAL_S = 5, 0.1
+STOP_MESSAGE_COUNT, STOP_MESSAGE_INTERVAL_S = 5, 0.1
 
 
 class ReleaseCommand:
@@ -44,7 +44,7 @@ class ReleaseCommand:
 
     ``is_still_due`` is checked before each transmission, so that the command does not undo a newer order or the control
     of another station. If the vehicle or the gimbal manager is silent, the command is sent at the next HEARTBEAT.
-    ``final_message`` is sent several times after the acknowledgement.
+    ``stop_message`` is sent several times after the acknowledgement.
     """
 
     def __init__(
@@ -53,14 +53,14 @@ class ReleaseCommand:
         command: int,
         params: tuple[float, ...],
         is_still_due: Callable[[], bool],
-        final_message: Message | None = None,
+        stop_message: Message | None = None,
     ) -> None:
         self._orders = orders
         self._session = orders.session
         self._command = command
         self._params = params
         self._is_still_due = is_still_due
-        self._final_message = final_message
+        self._stop_message = stop_message
         # Component id of the manager when this object was created; another manager may be known later.
         self._manager_id = orders.manager_id
 
@@ -136,19 +136,19 @@ class ReleaseCommand:
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
                 was_just_sent=True,
             )
-        if self._final_message is not None:
-            await self._send_several_times(self._final_message, command_sent_at=began_at)
+        if self._stop_message is not None:
+            await self._send_several_times(self._stop_message, command_sent_at=began_at)
 
     async def _send_several_times(self, message: Message, *, command_sent_at: float) -> None:
         arbiter = self._orders.context.arbiter
-        for _ in range(FINAL_MESSAGE_COUNT):
+        for _ in range(STOP_MESSAGE_COUNT):
             # While the computer slept or the vehicle was silent, another station may have begun to use the gimbal.
             has_computer_slept = arbiter.slept_since(command_sent_at) > 0
             is_vehicle_silent = not arbiter.is_state_recent
             if has_computer_slept or is_vehicle_silent or not self._session.is_open or not self._is_still_due():
                 return
             self._session.connection.send(message)
-            await asyncio.sleep(FINAL_MESSAGE_INTERVAL_S)
+            await asyncio.sleep(STOP_MESSAGE_INTERVAL_S)
 
     def _is_manager_silent(self) -> bool:
         is_autopilot = self._manager_id == self._session.component_id

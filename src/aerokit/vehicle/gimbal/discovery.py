@@ -52,7 +52,7 @@ class GimbalRegistry:
         self.control_requests: list[ControlRequest] = []
         # Maps component id to the loop time of the last HEARTBEAT or gimbal message.
         self._received_at: dict[int, float] = {}
-        # Start of the present period in which the autopilot was never silent.
+        # Time of the first HEARTBEAT after the autopilot's last silence.
         self._steady_since = math.inf
         context.session.on_reboot.append(self._on_reboot)
         self._listen(Heartbeat, self._record_received)

@@ -64,7 +64,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         _check_rates(*first_rates)
         self._orders = orders
         self._flags = int(LOCKED if is_from_north else LEVEL)
-        # Time at which the manager accepted the first rates. The manager's silence is counted from then on.
+        # Time at which the manager accepted the first rates. Its silence begins then, if it sends nothing.
         self._began_at = -math.inf
         self._order: Order | None = None
         # The error that describes the loss of control; None until control is lost.
@@ -180,7 +180,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             return order is not None and order.is_newest and not orders.is_taken
 
         # The command may overtake a message with an earlier rate, so messages with a rate of zero follow.
-        return ReleaseCommand(orders, PITCHYAW, params, is_still_due, final_message=self._encode_rates((0.0, 0.0)))
+        return ReleaseCommand(orders, PITCHYAW, params, is_still_due, stop_message=self._encode_rates((0.0, 0.0)))
 
     def _finish(self) -> None:
         self._stop("the block of the vehicle has ended")

@@ -311,7 +311,7 @@ class ParameterAccess:
             idle_timeout_s=idle_timeout_s,
             on_progress=on_progress,
         )
-        # A higher rate of answers is worth its cost only for many reads.
+        # A higher rate of PARAM_VALUE takes bandwidth from telemetry, so it is requested only for many reads.
         raise_rate_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
         try:
             with self._raised_rate(raise_rate_after_s):
@@ -331,7 +331,7 @@ class ParameterAccess:
             self.store.set_stale(name, old_value)
         stored = self.store.get(name)
         if stored is not None and not same_value(stored.value, value):
-            # Another value arrived after the confirmation. It may be a late answer, so the parameter is read again.
+            # Another value arrived after the confirmation. It may answer an earlier request, so read it again.
             self._read_later(name, self._transfers.connection.now() + STALE_VALUE_S)
 
     def is_in_doubt(self, name: str) -> bool:

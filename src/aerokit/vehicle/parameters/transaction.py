@@ -108,7 +108,7 @@ class _Block:
             if not isinstance(answer, Parameter):
                 raise answer
             # If another block has just restored the parameter, the answer may still be that block's temporary value.
-            current[name] = self._registry.restored.get(name) or self._with_all_bits(answer)
+            current[name] = self._registry.restored.get(name) or self._with_stored_precision(answer)
             if name not in self._saved:
                 self._saved[name] = current[name]
                 self._registry.add(name, self)
@@ -117,8 +117,8 @@ class _Block:
                 results[result.requested] = result.replace(parameter=current[result.name])
         return results
 
-    def _with_all_bits(self, answer: Parameter) -> Parameter:
-        """Return the stored parameter if it equals the answer, which may lack the last bits of a number."""
+    def _with_stored_precision(self, answer: Parameter) -> Parameter:
+        """Return the stored parameter if it equals the answer. PARAM_VALUE rounds large integers to a float."""
         # An answer that differs from the stored value is right: another station has undone our write, and the store has
         # ignored its message (`set_stale`).
         known = self._access.store.get(answer.name)

@@ -62,8 +62,8 @@ class CommandSender:
     commands never wait for each other. A late ack of a command whose call has already ended is not taken for the
     ack of the next command.
 
-    A command may belong to an order, such as a ``go_to`` call. When a newer order replaces this order, its command is
-    not repeated or, if it waits for an earlier command, not sent.
+    A command may belong to an order, such as a ``go_to`` call. When a newer order replaces it, the old order's
+    command is not repeated or, if it waits for an earlier command, not sent.
     """
 
     def __init__(
