@@ -140,14 +140,14 @@ def test_skipped_checks_round_trip(skipped: int) -> None:
 
 def test_parameter_under_requested_name() -> None:
     vehicles = Parameter("WP_SPD", to_float32(2.3), REAL32, 5.0, 7)
-    asked = known("WPNAV_SPEED", "WP_SPD").parameter(vehicles)
+    asked = known("WPNAV_SPEED", "WP_SPD").as_requested(vehicles)
     assert asked == Parameter("WPNAV_SPEED", 230.0, REAL32, 500.0, 7)
     vehicles = Parameter("PILOT_SPEED_UP", 250, INT16)
-    assert known("PILOT_SPD_UP", "PILOT_SPEED_UP").parameter(vehicles) == Parameter("PILOT_SPD_UP", 2.5, REAL32)
+    assert known("PILOT_SPD_UP", "PILOT_SPEED_UP").as_requested(vehicles) == Parameter("PILOT_SPD_UP", 2.5, REAL32)
     vehicles = Parameter("MAV_SYSID", 3, INT16, 1, 0)
-    assert known("SYSID_THISMAV", "MAV_SYSID").parameter(vehicles) == vehicles.replace(name="SYSID_THISMAV")
+    assert known("SYSID_THISMAV", "MAV_SYSID").as_requested(vehicles) == vehicles.replace(name="SYSID_THISMAV")
     vehicles = Parameter("ARMING_SKIPCHK", 0, INT32, 0, 0)
-    assert known("ARMING_CHECK", "ARMING_SKIPCHK").parameter(vehicles).value == 1
+    assert known("ARMING_CHECK", "ARMING_SKIPCHK").as_requested(vehicles).value == 1
 
 
 def test_translate_values_of_whole_file() -> None:

@@ -98,7 +98,7 @@ class Renamed(Snapshot):
         """Convert a value of the vehicle to the program's units."""
         return self._convert(value, from_name=self.name)
 
-    def parameter(self, parameter: Parameter) -> Parameter:
+    def as_requested(self, parameter: Parameter) -> Parameter:
         """Return the vehicle's parameter with the name and units that the program asked for.
 
         A scaled value becomes a REAL32.

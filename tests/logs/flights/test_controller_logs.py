@@ -98,7 +98,7 @@ def test_setpoint_without_east_row_is_skipped(logs: Logs) -> None:
 def test_velocity_setpoints_need_no_origin(logs: Logs) -> None:
     flight = logs.read_bin(without="ORGN")
     assert flight.velocity_target["north_m_s"][5] == 4.5
-    assert not flight.position_target.has("latitude_deg")
+    assert not flight.position_target.has_values("latitude_deg")
 
 
 GLOBAL = "Q:timestamp d:lat d:lon f:alt ?:lat_lon_valid ?:alt_valid"

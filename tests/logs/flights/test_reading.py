@@ -220,8 +220,8 @@ def test_unknown_battery_values_of_ardupilot_are_nan(tmp_path: Path) -> None:
     path = tmp_path / "flight.bin"
     wanted.write_bin(path)
     battery = read_flight(path).batteries[1]
-    assert battery.has("voltage_v")
-    assert not any(battery.has(name) for name in ("current_a", "used_mah", "remaining_percent"))
+    assert battery.has_values("voltage_v")
+    assert not any(battery.has_values(name) for name in ("current_a", "used_mah", "remaining_percent"))
 
 
 def test_unknown_battery_values_of_px4_are_nan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,7 +232,7 @@ def test_unknown_battery_values_of_px4_are_nan(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(wanted, "_ulog_rows", lambda: rows)
     wanted.write_ulog(path)
     battery = read_flight(path).batteries[0]
-    assert not any(battery.has(name) for name in battery)
+    assert not any(battery.has_values(name) for name in battery)
     states = [dict(entry.states) for entry in UlogReader(path).entries(lambda _: None)]
     assert {state["batteries"] for state in states if "batteries" in state} == {(Battery(0, None, None, None),)}
 

@@ -62,7 +62,7 @@ class TimeSeries:
         for name, column in self._values.items():
             column.extend(columns.get(name, missing))
 
-    def has(self, *names: str) -> bool:
+    def has_values(self, *names: str) -> bool:
         """Return True if one of these columns has a known value. Without names, all columns are searched."""
         # `value == value` is False for NaN. Calling math.isnan for each of millions of values would be slow.
         return any(value == value for name in names or self.names for value in self._values[name])

@@ -243,11 +243,11 @@ class _Reader:
         setpoints, destinations = self._flight.position_target, self._destinations
         # POSITION_TARGET_GLOBAL_INT has the place to which the vehicle flies. It is used only if no other message has
         # logged the places of set-points.
-        if setpoints.has("latitude_deg"):
+        if setpoints.has_values("latitude_deg"):
             return
         # The rows of `setpoints` without places have heights from NAV_CONTROLLER_OUTPUT. If there are any, the heights
         # from POSITION_TARGET_GLOBAL_INT are not used.
-        has_heights = setpoints.has()
+        has_heights = setpoints.has_values()
         rows = list(_rows_of(setpoints))
         for time, latitude, longitude, amsl, relative in _rows_of(destinations):
             heights = (NAN, NAN) if has_heights else (amsl, relative)

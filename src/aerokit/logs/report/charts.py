@@ -118,7 +118,7 @@ def mode_colours(flight: FlightLog) -> dict[str, str]:
 
 def line_trace(name: str, series: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
     """Return a column as a line of a timeline; None if all of its values are unknown."""
-    if not series.has(column):
+    if not series.has_values(column):
         return None
     x, y = drawn_points(series, column, digits)
     return {"x": x, "y": y, "name": name, "mode": "lines", "connectgaps": False, **style}

@@ -118,7 +118,7 @@ def _overlay_section(
     traces, names_without_data = [], []
     for number, flight in enumerate(flights):
         series = get_series(flight)
-        if series is None or not series.has(column):
+        if series is None or not series.has_values(column):
             names_without_data.append(NAMES[number])
             continue
         times, values = drawn_points(series, column)

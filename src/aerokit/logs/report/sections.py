@@ -151,14 +151,14 @@ def _actual_and_setpoint(
         )
         for name, column in columns.items()
     ]
-    if any(charts) and not setpoints.has():
+    if any(charts) and not setpoints.has_values():
         return [*charts, Paragraphs([f"The log contains no {quantity} set-points."])]
     return [*charts]
 
 
 def _air_speed_line(flight: FlightLog) -> dict[str, Any] | None:
     # Without a sensor, all air speeds are 0.
-    has_speed = flight.air.has("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
+    has_speed = flight.air.has_values("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
     return line_trace("air speed", flight.air, "air_speed_m_s", digits=2) if has_speed else None
 
 
@@ -186,7 +186,7 @@ def _vibration(flight: FlightLog) -> Section:
         missing="The log contains no vibration levels.",
     )
     names = {"x_m_s2": "x", "y_m_s2": "y", "z_m_s2": "z"}
-    if flight.autopilot == "PX4" and not flight.vibration.has("y_m_s2"):
+    if flight.autopilot == "PX4" and not flight.vibration.has_values("y_m_s2"):
         names = {"x_m_s2": "all axes"}
     axes = [line_trace(label, flight.vibration, name, digits=2) for name, label in names.items()]
     levels = timeline(flight, "vibration", "m/s²", axes)

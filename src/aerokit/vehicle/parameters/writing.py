@@ -51,7 +51,7 @@ class ResolvedParameter(Snapshot):
 
     def as_requested(self, parameter: Parameter) -> Parameter:
         """Convert a parameter of the vehicle to the name and unit of the program."""
-        return parameter if self.renamed is None else self.renamed.parameter(parameter)
+        return parameter if self.renamed is None else self.renamed.as_requested(parameter)
 
 
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
