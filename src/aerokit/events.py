@@ -107,8 +107,8 @@ class VehicleRecovered(Event):
 class VehicleRebooted(Event):
     """The autopilot rebooted: its time since boot went backwards. aerokit requests message rates again.
 
-    Also published if the time since boot does not continue after a lost link was reopened: the vehicle has rebooted, or
-    the link leads to another vehicle.
+    Also published if the time since boot does not continue after a lost link was reopened, or cannot be compared: the
+    vehicle has rebooted, or the link leads to another vehicle.
     """
 
 

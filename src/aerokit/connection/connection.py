@@ -463,6 +463,17 @@ class Connection:
         self._state_tracker.record_activity(self._clock())
         self.bus.publish(LinkRestored(self._clock(), system_id=0, away_s=away_s))
 
+    def hold_back(self, system_id: int, on_frame: Callable[[Frame], object]) -> Detach:
+        """Give the frames of this system to ``on_frame`` only, until the returned function is called.
+
+        ``on_frame`` may call that function; the frame is then delivered. The recording has all frames.
+        """
+        return self._receiver.hold_back(system_id, on_frame)
+
+    def is_held_back(self, system_id: int) -> bool:
+        """Return True while the frames of this system are held back."""
+        return self._receiver.is_held_back(system_id)
+
     def link_stalled(self, unsent_bytes: int) -> None:
         """Called when written data has stopped leaving this machine."""
         self.bus.publish(LinkStalled(self._clock(), system_id=0, unsent_bytes=unsent_bytes))

@@ -308,8 +308,8 @@ class Order:
         elif armed_before and not armed and self._ends_on_disarm:
             self.takeover_reason = self.takeover_reason or "the vehicle disarmed"
 
-    def on_reboot(self) -> None:
-        self.takeover_reason = self.takeover_reason or "the vehicle rebooted"
+    def end_by_reboot(self, reason: str) -> None:
+        self.takeover_reason = self.takeover_reason or reason
 
 
 class SentCommand:

@@ -226,8 +226,9 @@ class CommandSender:
         self._accepted_at.pop(key, None)
 
     def forget_results(self) -> None:
-        # A rebooted vehicle may support other commands.
+        # A rebooted vehicle may support other commands, and does not execute those from before.
         self._results.clear()
+        self._accepted_at.clear()
 
     async def _run(self, message: CommandLong | CommandInt, options: _Options) -> CommandAck:
         """Send a command and return its ACCEPTED ack. Waits for earlier calls of the same command."""

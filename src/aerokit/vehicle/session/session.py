@@ -365,7 +365,7 @@ class VehicleSession:
         self.add_timeout_hint(*self.telemetry.cells.values(), self.link_quality, self.watch.link_state)
         self._detach_callbacks += [
             *self._publish_changes(),
-            bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
+            bus.attach_event(LinkRestored, self._on_link_restored),
             bus.attach_event(LinkSelected, self._on_link_selected),
             bus.attach_event(ComputerSlept, self._on_computer_slept),
             self.connection.on_end(self._on_end),
@@ -414,6 +414,11 @@ class VehicleSession:
         if event.system_id == self.system_id and event.before is not None:
             self.rates.request_again()
 
+    def _on_link_restored(self, event: LinkRestored) -> None:
+        self.rates.request_again()
+        # The answers show whether it is the same boot of the same vehicle.
+        self.link_watch.request_time()
+
     def _on_computer_slept(self, event: ComputerSlept) -> None:
         # The loop's clock stood still while the computer slept, so the ages do not include this time yet.
         self.watch.last_heartbeat_at -= event.seconds
@@ -428,6 +433,8 @@ class VehicleSession:
 
     def _on_second(self) -> None:
         self.watch.check()
+        if self.connection.is_held_back(self.system_id):
+            self.link_watch.request_time()
         self.telemetry.expire(self.connection.now())
 
     async def _learn_constants(self) -> None:
