@@ -398,6 +398,18 @@ def test_round_trip_uses_first_answer() -> None:
     assert stage.answers == [(5.0, 77)]
 
 
+def test_round_trip_without_further_answers_is_unknown_again() -> None:
+    stage = Measured()
+    question = stage.request_time()
+    stage.at = 1.0
+    stage.receive(Timesync(77_000_000, question.ts1))
+    stage.at = 11.0
+    assert stage.watch.round_trip_s == 1.0
+    stage.at = 11.1
+    assert stage.watch.round_trip_s is None
+    assert stage.report((0, 0), 0).round_trip_s is None
+
+
 def test_loss_and_rates_of_a_second() -> None:
     stage = Measured()
     report = stage.report((75, 25), 4000)

@@ -54,6 +54,8 @@ CLOCK_SPAN_S = 5.0
 REAL_TIME_SPAN_S, REAL_TIME_TOLERANCE_RATIO = 1.0, 0.1
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
+# A round trip is unknown again after this many seconds without an answer to TIMESYNC, because the link may have changed.
+ROUND_TRIP_MAX_AGE_S = 10.0
 BOOT_CLOCK = "time_boot_ms"
 OTHER_BOOT = "the reopened link does not lead to the same boot of the same vehicle, as far as its clock shows"
 """Error text about a vehicle that has not proved, after the link was reopened, to be in the same boot."""
@@ -388,6 +390,7 @@ class LinkWatch:
         # Called with each TIMESYNC answer: our time of the request (s), and the vehicle's time (ms).
         self._on_answer = on_answer
         self._round_trip_s: float | None = None
+        self._measured_at = -math.inf  # time of the last measurement of the round trip
         # The times (ns) in the unanswered TIMESYNC requests. Each answer repeats the time of its request.
         self._open_requests: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
         self._next_request_at = connection.now()
@@ -400,7 +403,8 @@ class LinkWatch:
 
     @property
     def round_trip_s(self) -> float | None:
-        return self._round_trip_s
+        is_recent = self._connection.now() - self._measured_at <= ROUND_TRIP_MAX_AGE_S
+        return self._round_trip_s if is_recent else None
 
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Publish a report and call ``on_tick`` once a second, until the connection ends."""
@@ -435,7 +439,7 @@ class LinkWatch:
             now = self._connection.now()
             # An answer that was processed long after its arrival would measure this program's delay, not the link's.
             if now - frame.received_at < CHECK_INTERVAL_S:
-                self._round_trip_s = now - message.ts1 / 1e9
+                self._round_trip_s, self._measured_at = now - message.ts1 / 1e9, now
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:
@@ -448,7 +452,7 @@ class LinkWatch:
             counts.at,
             self._system_id,
             loss_percent=100 * missing / (frames + missing) if frames + missing else None,
-            round_trip_s=self._round_trip_s,
+            round_trip_s=self.round_trip_s,
             frames_per_s=frames / seconds,
             bytes_per_s=(counts.total_bytes - before.total_bytes) / seconds,
         )
