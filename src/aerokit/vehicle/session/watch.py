@@ -54,7 +54,7 @@ CLOCK_SPAN_S = 5.0
 REAL_TIME_SPAN_S, REAL_TIME_TOLERANCE_RATIO = 1.0, 0.1
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
-# A round trip is unknown again after this many seconds without an answer to TIMESYNC, because the link may have changed.
+# A round trip is unknown again after this many seconds without an answer to TIMESYNC. The link may have changed.
 ROUND_TRIP_MAX_AGE_S = 10.0
 BOOT_CLOCK = "time_boot_ms"
 OTHER_BOOT = "the reopened link does not lead to the same boot of the same vehicle, as far as its clock shows"
