@@ -183,6 +183,15 @@ def test_decreased_constant_time_is_no_reboot() -> None:
         assert stage.clock(5000) == 0
 
 
+def test_boot_clock_that_wraps_after_49_days_is_no_reboot() -> None:
+    stage, days = Watched(), 1 << 32
+    for running_ms in range(days - 2000, days + 20_000, 100):
+        assert stage.clock(running_ms % days) == 0
+    assert stage.boot_clocks[1, 1](stage.at) == 19_900
+    stage.clock(50)  # This is a reboot.
+    assert stage.clock(350, after=0.3) == 1
+
+
 def test_messages_of_other_components_are_ignored() -> None:
     stage = Watched()
     stage.clock(100_000)

@@ -56,7 +56,7 @@ REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
 # A round trip is unknown again after this many seconds without an answer to TIMESYNC. The link may have changed.
 ROUND_TRIP_MAX_AGE_S = 10.0
-BOOT_CLOCK = "time_boot_ms"
+BOOT_CLOCK, BOOT_CLOCK_RANGE_MS = "time_boot_ms", 1 << 32
 OTHER_BOOT = "the reopened link does not lead to the same boot of the same vehicle, as far as its clock shows"
 """Error text about a vehicle that has not proved, after the link was reopened, to be in the same boot."""
 # Maximum number of unanswered TIMESYNC requests; older ones are considered lost.
@@ -179,7 +179,7 @@ class VehicleWatch:
         last = self._last_readings.get(BOOT_CLOCK)
         if last is None or BOOT_CLOCK not in self._first_readings:
             return None
-        return last.milliseconds + self._clock_speed() * (now - last.read_at)
+        return (last.milliseconds + self._clock_speed() * (now - last.read_at)) % BOOT_CLOCK_RANGE_MS
 
     def _clock_speed(self, clock: str = BOOT_CLOCK) -> float:
         """Return how many milliseconds this clock of the vehicle advances in a second."""
@@ -295,8 +295,11 @@ class VehicleWatch:
         ``clock`` names the message or field with the time.
         """
         now = self._now()
+        previous = self._last_readings.get(clock)
+        if clock == BOOT_CLOCK and previous is not None and milliseconds < previous.milliseconds:
+            milliseconds = self._unwrapped(milliseconds, previous, now)
         reading = _ClockReading(milliseconds, now, now - frame.received_at)
-        previous = self._last_readings.get(clock, reading)
+        previous = previous or reading
         if self._is_expected_reboot(frame, previous, milliseconds):
             self._on_reboot_detected({clock: reading})
         elif previous.milliseconds - milliseconds <= REBOOT_MIN_DECREASE_MS:  # The decrease is too small for a reboot.
@@ -308,6 +311,13 @@ class VehicleWatch:
             self._on_reboot_detected({clock: reading})
         if clock in self._lost_clocks and self._is_other_boot(clock, reading):
             self._on_reboot_detected({clock: reading})
+
+    def _unwrapped(self, milliseconds: int, previous: _ClockReading, now: float) -> int:
+        """Return a reading of ``time_boot_ms``, which begins at 0 again after 49.7 days, as a time that only grows."""
+        expected = previous.milliseconds + self._clock_speed() * (now - previous.read_at)
+        wraps = round((expected - milliseconds) / BOOT_CLOCK_RANGE_MS)
+        unwrapped = milliseconds + wraps * BOOT_CLOCK_RANGE_MS
+        return unwrapped if abs(unwrapped - expected) <= REBOOT_MIN_DECREASE_MS else milliseconds
 
     def _is_other_boot(self, clock: str, reading: _ClockReading) -> bool:
         """Return True if the clock does not continue that from before the last loss of the link."""
