@@ -15,7 +15,7 @@ import anyio
 import pytest
 from leak_check import run_and_do
 
-from aerokit import Vehicle, connect, events, open_connection
+from aerokit import Signing, SigningKey, Vehicle, connect, events, open_connection
 from aerokit import messages as m
 from aerokit.connection.connection import Connection
 from aerokit.errors import (
@@ -330,6 +330,23 @@ async def test_setpoints_are_not_sent_to_other_vehicle_on_restored_link() -> Non
                 await exchange()
                 await anyio.sleep(4)
         assert not received
+
+
+async def test_signing_key_is_not_sent_to_other_vehicle_on_restored_link() -> None:
+    async with cabled_beside_other() as (_, vehicle, other, exchange):
+        received: list[object] = []
+        other.observe(m.SetupSigning, lambda message, _: received.append(message))
+        await exchange()
+        with pytest.raises(OperationRejected, match="same boot of the same vehicle"):
+            await vehicle.setup_signing(Signing(SigningKey(b"k" * 32)))
+        assert not received
+
+
+async def test_rest_of_order_is_not_sent_to_other_vehicle_on_restored_link() -> None:
+    async with cabled_beside_other() as (_, vehicle, _, exchange):
+        await exchange()
+        with pytest.raises(OperationRejected, match="nothing was sent to it"):
+            await vehicle._session.wait_for_heartbeat()
 
 
 @pytest.mark.parametrize("transfer", ["parameters", "upload", "log"])

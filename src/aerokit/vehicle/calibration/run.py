@@ -212,6 +212,8 @@ class CalibrationRun:
                     self._is_unconfirmed = False
                     return
             logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)
+        except OperationRejected:  # The reopened link may lead to another vehicle.
+            self._is_unconfirmed = False
         except (ConnectionClosed, LinkLost):  # The vehicle can no longer be reached.
             pass
         finally:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, OperationRejected
 from aerokit.protocols.command import MAX_HEARTBEAT_AGE_S
-from aerokit.vehicle.commanding.order import SUPERSEDED, Order, SentCommand
+from aerokit.vehicle.commanding.order import REBOOTED, SUPERSEDED, Order, SentCommand
 from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ class CommandArbiter:
             callback()
 
     def on_reboot(self) -> None:
-        reason = OTHER_BOOT if self._is_held_back() else "the vehicle rebooted"
+        reason = OTHER_BOOT if self._is_held_back() else REBOOTED
         for order in (*self._orders_in_progress, *self._posted_orders):
             order.end_by_reboot(reason)
         self._ordered_since_disarmed.clear()

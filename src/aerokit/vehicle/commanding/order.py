@@ -30,6 +30,8 @@ HOME: Topic = "home position"
 
 SUPERSEDED = "another order was given"
 """Reason for the end of an order that a newer order replaced."""
+REBOOTED = "the vehicle rebooted"
+"""Reason for the end of an order by a reboot."""
 
 # A new mode also changes how the vehicle moves.
 _MODE: tuple[Subject, ...] = ("mode", "motion")

@@ -42,7 +42,7 @@ from aerokit.vehicle.session.commands import CommandSender
 from aerokit.vehicle.session.rates import MessageRates
 from aerokit.vehicle.session.subscriber import ComponentSubscriber, WatchedStream
 from aerokit.vehicle.session.transfers import Transfers
-from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
+from aerokit.vehicle.session.watch import OTHER_BOOT, LinkWatch, VehicleWatch
 from aerokit.vehicle.state.field import MESSAGE_IDS
 from aerokit.vehicle.state.states import STATES
 from aerokit.vehicle.state.telemetry import Telemetry
@@ -269,7 +269,11 @@ class VehicleSession:
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
-        """Wait for a HEARTBEAT received after ``since``, by default after this call."""
+        """Wait for a HEARTBEAT received after ``since``, by default after this call.
+
+        Raises OperationRejected if a link was reopened meanwhile that may lead to another vehicle.
+        """
+        other_boots = self.watch.other_boots
         # Every HEARTBEAT updates `armed`.
         armed = self.telemetry.armed
         start = self.connection.now() if since is None else since
@@ -277,6 +281,8 @@ class VehicleSession:
         await armed.wait_until(
             lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
         )
+        if self.watch.other_boots != other_boots:
+            raise OperationRejected(f"{OTHER_BOOT}; nothing was sent to it")
 
     def is_answer(self, ack: CommandAck, command: int) -> bool:
         frame = ack.received_frame

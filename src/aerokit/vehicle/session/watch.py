@@ -116,6 +116,8 @@ class VehicleWatch:
         self._has_ended = False
         self.reboots: int = 0
         """Number of reboots detected."""
+        self.other_boots: int = 0
+        """Number of these after which the reopened link may lead to another vehicle."""
         self._last_readings: dict[str, _ClockReading] = {}
         # The first reading of each clock since the start of the session or a reboot.
         self._first_readings: dict[str, _ClockReading] = {}
@@ -365,6 +367,7 @@ class VehicleWatch:
         self._last_answer = _ClockReading(0, now)
         self._reboot_ordered_at = None
         self.reboots += 1
+        self.other_boots += self._deliver_again is not None
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
         self._end_proof()  # The subscribers above can still see that the link was lost.
