@@ -332,7 +332,7 @@ async def test_setpoints_are_not_sent_to_other_vehicle_on_restored_link() -> Non
         assert not received
 
 
-async def test_signing_key_is_not_sent_to_other_vehicle_on_restored_link() -> None:
+async def test_restored_link_to_other_vehicle_gets_no_signing_key() -> None:
     async with cabled_beside_other() as (_, vehicle, other, exchange):
         received: list[object] = []
         other.observe(m.SetupSigning, lambda message, _: received.append(message))
@@ -342,7 +342,7 @@ async def test_signing_key_is_not_sent_to_other_vehicle_on_restored_link() -> No
         assert not received
 
 
-async def test_rest_of_order_is_not_sent_to_other_vehicle_on_restored_link() -> None:
+async def test_restored_link_to_other_vehicle_gets_no_rest_of_order() -> None:
     async with cabled_beside_other() as (_, vehicle, _, exchange):
         await exchange()
         with pytest.raises(OperationRejected, match="nothing was sent to it"):

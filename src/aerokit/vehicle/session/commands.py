@@ -332,7 +332,7 @@ class CommandSender:
         earliest = frame.received_at - COPY_WINDOW_S
         is_equal = any(ack.body == frame.body and ack.received_at >= earliest for ack in self._recent_acks)
         if is_equal and not self._has_constant_sequence(frame):
-            return True  # A copy is not recorded. Otherwise each one would prolong the time in which the next is a copy.
+            return True  # A copy is not recorded, because it would prolong the time in which others count as copies.
         self._recent_acks.append(frame)
         return False
 
