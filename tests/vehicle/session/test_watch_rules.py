@@ -313,16 +313,18 @@ def test_lost_link_without_clock_afterwards_is_reboot() -> None:
     assert stage.watch.last_heartbeat_at < 20.0  # Until then, no message counts.
 
 
-def test_timesync_answer_shows_same_boot_after_lost_link() -> None:
+@pytest.mark.parametrize(("booted_at", "reboots"), [(0.0, 0), (-1.7e9, 1)])
+def test_timesync_answer_shows_same_boot_after_lost_link(booted_at: float, reboots: int) -> None:
+    """The time of day shows nothing, because all vehicles have the same."""
     stage = Watched()
     for _ in range(2):
         stage.at += 10.0
-        stage.receive(Timesync(round(stage.at * 1e9), 5))
+        stage.receive(Timesync(round((stage.at - booted_at) * 1e9), 5))
     stage.lose_link()
     stage.at += 10.0
-    stage.receive(Timesync(round(stage.at * 1e9), 5))
+    stage.receive(Timesync(round((stage.at - booted_at) * 1e9), 5))
     stage.receive(HEARTBEAT)
-    assert (stage.watch.reboots, stage.watch.last_heartbeat_at) == (0, stage.at)
+    assert (stage.watch.reboots, stage.watch.last_heartbeat_at) == (reboots, stage.at)
 
 
 def test_timesync_request_of_vehicle_is_ignored() -> None:

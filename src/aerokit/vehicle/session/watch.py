@@ -50,6 +50,8 @@ RESUME_TIMEOUT_S = 5.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
 # many seconds apart.
 CLOCK_SPAN_S = 5.0
+# A greater time, in TIMESYNC answers of other firmware, is the time of day, which is the same on all vehicles.
+MAX_RUNNING_TIME_MS = 100_000_000_000
 # A clock that keeps real time to within this fraction for at least this many seconds is not that of a fast simulation.
 REAL_TIME_SPAN_S, REAL_TIME_TOLERANCE_RATIO = 1.0, 0.1
 REPORT_PERIOD_S = 1.0
@@ -246,6 +248,8 @@ class VehicleWatch:
     def _lost_clock(self, clock: str) -> _LostClock | None:
         """Return what is known about a clock when the link is lost; None if its speed is unknown."""
         first, last = self._first_readings[clock], self._last_readings[clock]
+        if last.milliseconds > MAX_RUNNING_TIME_MS:
+            return None
         min_span_s = last.read_at - first.read_at - last.waited_s
         if min_span_s > CLOCK_SPAN_S:
             wrong_by_s = RESUME_TOLERANCE_S + first.waited_s + last.waited_s
