@@ -107,8 +107,8 @@ class VehicleRecovered(Event):
 class VehicleRebooted(Event):
     """The autopilot rebooted: its time since boot went backwards. aerokit requests message rates again.
 
-    Also published if the time since boot does not continue after a lost link was reopened: the vehicle has rebooted, or
-    the link leads to another vehicle.
+    Also published if the time since boot does not continue after a lost link was reopened, or cannot be compared: the
+    vehicle has rebooted, or the link leads to another vehicle.
     """
 
 
@@ -282,8 +282,8 @@ class LinkReport(Event):
     """Link quality of the last second, published every second.
 
     ``loss_percent`` is derived from missing sequence numbers (None before the first frame). ``round_trip_s`` is the
-    last measurement by TIMESYNC (None before the first answer). ``frames_per_s`` and ``bytes_per_s`` count received
-    data.
+    last measurement by TIMESYNC (None if there was no answer in the last ten seconds). ``frames_per_s`` and
+    ``bytes_per_s`` count received data.
     """
 
     loss_percent: float | None

@@ -15,7 +15,7 @@ import anyio
 import pytest
 from leak_check import run_and_do
 
-from aerokit import Vehicle, connect, events, open_connection
+from aerokit import Signing, SigningKey, Vehicle, connect, events, open_connection
 from aerokit import messages as m
 from aerokit.connection.connection import Connection
 from aerokit.errors import (
@@ -25,11 +25,14 @@ from aerokit.errors import (
     LinkLost,
     OperationRejected,
     RecordingEnded,
+    SetpointStreamStopped,
 )
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.framer import Framer
+from aerokit.missions import Mission
+from aerokit.missions.navigation import waypoint
 from aerokit.sim import SimulatedCopter, open_simulator, simulated_link
 from aerokit.transport import Link, Peer, ReconnectingLink, TcpConnect, TcpListen
 from aerokit.transport.link import BaseLink
@@ -134,6 +137,7 @@ async def cabled(copter: SimulatedCopter | None = None, **options: Any) -> Async
 async def test_interruption_events() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()
+        await anyio.sleep(2)
         with vehicle.subscribe(*NEWS, capacity=9) as news:
             await cable.is_away(6)
             received = [await news.get(10) for _ in range(4)]
@@ -223,6 +227,7 @@ async def test_pilot_who_arms_after_unsent_arming_keeps_vehicle() -> None:
 async def test_order_is_sent_when_link_is_restored() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()
+        await anyio.sleep(2)
         async with anyio.create_task_group() as tasks:
             cable.pull()
             tasks.start_soon(vehicle.set_mode, "GUIDED")
@@ -267,28 +272,111 @@ async def test_vehicle_switched_off_with_its_cable() -> None:
         await vehicle.wait_ready()
 
 
-async def test_other_vehicle_on_restored_link_is_not_taken_for_first() -> None:
-    older, name = SimulatedCopter(boot_time_s=0), "FENCE_ALT_MAX"
-    older.parameters[name] = 77.0
-    async with simulated_link(older) as other_link:
+@asynccontextmanager
+async def cabled_beside_other() -> AsyncIterator[tuple[Cable, Vehicle, SimulatedCopter, Callable[[], Awaitable[None]]]]:
+    """Yield a cable to a vehicle, another vehicle with the same ids, and a function that plugs the cable into it."""
+    other = SimulatedCopter(boot_time_s=0)
+    async with simulated_link(other) as other_link:
         await anyio.sleep(60)
         async with cabled() as (cable, vehicle):
-            await vehicle.wait_ready()
-            await vehicle.parameters.download()
-            await anyio.sleep(8)
-            with (
-                vehicle.subscribe(events.LinkRestored) as restored,
-                vehicle.subscribe(events.VehicleRebooted) as reboots,
-            ):
+
+            async def exchange() -> None:
                 cable.pull()
                 cable.link.close()
                 cable.link = other_link
                 await other_link.open(cable)
                 cable.plug_in()
-                await restored.get(10)
-                writes = await vehicle.parameters.upload({name: 100.0})
-                await reboots.get(5)
-            assert (writes[name].outcome, older.parameters[name]) == ("set", 100.0)
+
+            await vehicle.wait_ready()
+            await anyio.sleep(8)
+            yield cable, vehicle, other, exchange
+
+
+async def test_other_vehicle_on_restored_link_is_not_taken_for_first() -> None:
+    async with cabled_beside_other() as (_, vehicle, other, exchange):
+        name = "FENCE_ALT_MAX"
+        other.parameters[name] = 77.0
+        await vehicle.parameters.download()
+        with (
+            vehicle.subscribe(events.LinkRestored) as restored,
+            vehicle.subscribe(events.VehicleRebooted) as reboots,
+        ):
+            await exchange()
+            await restored.get(10)
+            writes = await vehicle.parameters.upload({name: 100.0})
+            await reboots.get(5)
+        assert (writes[name].outcome, other.parameters[name]) == ("set", 100.0)
+
+
+async def test_order_is_not_repeated_to_other_vehicle_on_restored_link() -> None:
+    async with cabled_beside_other() as (cable, vehicle, other, exchange):
+        await exchange()
+        with pytest.raises(OperationRejected, match="same boot of the same vehicle"):
+            await vehicle.set_mode("GUIDED")
+        assert other.mode.name == "STABILIZE"
+        assert not any(message.command == MavCmd.DO_SET_MODE for message in cable.sent)
+
+
+async def test_setpoints_are_not_sent_to_other_vehicle_on_restored_link() -> None:
+    async with cabled_beside_other() as (_, vehicle, other, exchange):
+        await vehicle.set_mode("GUIDED")
+        await vehicle.arm()
+        await vehicle.take_off(10)
+        received: list[m.SetPositionTargetLocalNed] = []
+        other.observe(m.SetPositionTargetLocalNed, lambda message, _: received.append(message))
+        with pytest.raises(SetpointStreamStopped, match="same boot of the same vehicle"):
+            async with vehicle.guided.velocity(valid_for_s=60):
+                await anyio.sleep(1)
+                await exchange()
+                await anyio.sleep(4)
+        assert not received
+
+
+async def test_restored_link_to_other_vehicle_gets_no_signing_key() -> None:
+    async with cabled_beside_other() as (_, vehicle, other, exchange):
+        received: list[object] = []
+        other.observe(m.SetupSigning, lambda message, _: received.append(message))
+        await exchange()
+        with pytest.raises(OperationRejected, match="same boot of the same vehicle"):
+            await vehicle.setup_signing(Signing(SigningKey(b"k" * 32)))
+        assert not received
+
+
+async def test_restored_link_to_other_vehicle_gets_no_rest_of_order() -> None:
+    async with cabled_beside_other() as (_, vehicle, _, exchange):
+        await exchange()
+        with pytest.raises(OperationRejected, match="nothing was sent to it"):
+            await vehicle._session.wait_for_heartbeat()
+
+
+@pytest.mark.parametrize("transfer", ["parameters", "upload", "log"])
+async def test_transfer_does_not_mix_vehicles_of_restored_link(transfer: str) -> None:
+    async with cabled_beside_other() as (_, vehicle, other, exchange):
+        mission = Mission([waypoint(vehicle.position.value.replace(altitude_relative_m=20.0))] * 200)
+        (entry, *_) = await vehicle.logs.list()
+        has_begun = anyio.Event()
+
+        def on_progress(_: object) -> None:
+            has_begun.set()
+
+        calls: dict[str, Callable[[], Awaitable[object]]] = {
+            "parameters": lambda: vehicle.parameters.download(method="list", on_progress=on_progress),
+            "upload": lambda: vehicle.mission.upload(mission, method="items", on_progress=on_progress),
+            "log": lambda: vehicle.logs.read(entry, method="log", on_progress=on_progress),
+        }
+        received: list[object] = []
+        for kind in (m.MissionCount, m.MissionItemInt, m.LogRequestData, m.ParamRequestRead):
+            other.observe(kind, lambda message, _: received.append(message))
+
+        async def exchange_soon() -> None:
+            await has_begun.wait()
+            await exchange()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(exchange_soon)
+            with pytest.raises(OperationRejected, match="transfer has ended: the reopened link"):
+                await calls[transfer]()
+        assert not received
 
 
 async def test_connect_finds_vehicle_on_restored_link() -> None:

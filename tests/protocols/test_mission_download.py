@@ -44,12 +44,26 @@ def test_mission_download_restarts_eight_times() -> None:
     lists = 0
     while not exchange.done:
         lists += sum(isinstance(message, m.MissionRequestList) for message in exchange.take_outbox())
+        exchange.receive(m.MissionCount(*GCS, 3), now + 0.1)
+        exchange.receive(m.MissionAck(*GCS, Result.ERROR), now + 0.2)
         now += 1.0
-        exchange.receive(m.MissionCount(*GCS, 3), now)
-        exchange.receive(m.MissionAck(*GCS, Result.ERROR), now)
+        exchange.expire(now)
     assert lists == 1 + MAX_RESTARTS == 9
     with pytest.raises(MissionRejected):
         exchange.result()
+
+
+def test_mission_download_ignores_errors_for_late_items_of_upload() -> None:
+    """ArduPilot answers each copy of an item that arrives after the upload with ERROR, and answers the requests."""
+    exchange = download(round_trip=RoundTrip(0.1))
+    exchange.start(0.0)
+    exchange.receive(m.MissionCount(*GCS, 20), 0.1)
+    for seq, item in enumerate(HELD[:20]):
+        exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.2 + 0.1 * seq)
+        message = to_wire(item, seq, target_system=GCS[0], target_component=GCS[1], mission_type=0)
+        exchange.receive(message, 0.2 + 0.1 * seq)
+    assert list(exchange.result().items) == HELD[:20]
+    assert sum(isinstance(message, m.MissionRequestList) for message in exchange.take_outbox()) == 1
 
 
 @pytest.mark.parametrize(
@@ -70,6 +84,7 @@ def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked
     answer(m.MissionCount(*GCS, 3, 0, 7 if opaque_id else 0), 101.0)
     answer(to_wire(held[0], 0, target_system=GCS[0], target_component=GCS[1], mission_type=0), 102.0)
     assert answer(m.MissionAck(*GCS, Result.ERROR), 103.0) == []
+    exchange.expire(103.5)
     kept = int(opaque_id == 7)
     assert answer(m.MissionCount(*GCS, 3, 0, opaque_id), 104.0) == asked
     assert [event.done for event in reported] == [0, 1, kept]

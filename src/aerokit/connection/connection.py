@@ -319,7 +319,8 @@ class Connection:
         """Call ``callback(frame, peer)`` with every received frame, after the subscribers got the message.
 
         Frames with message ids outside the dialect are included, and their checksums are not checked. Frames of a
-        second peer under the ids of a known component are refused, and not included. The callback must return quickly;
+        second peer under the ids of a known component are refused, and not included, and so are those of a vehicle
+        after a lost link until its time since boot shows that it is the same. The callback must return quickly;
         its exceptions are logged. Observers cost time, because every frame must then become an object.
         """
         return self._observers.add(callback)
@@ -462,6 +463,17 @@ class Connection:
         self._receiver.reset()
         self._state_tracker.record_activity(self._clock())
         self.bus.publish(LinkRestored(self._clock(), system_id=0, away_s=away_s))
+
+    def hold_back(self, system_id: int, on_frame: Callable[[Frame], object]) -> Detach:
+        """Give the frames of this system to ``on_frame`` only, until the returned function is called.
+
+        ``on_frame`` may call that function; the frame is then delivered. The recording has all frames.
+        """
+        return self._receiver.hold_back(system_id, on_frame)
+
+    def is_held_back(self, system_id: int) -> bool:
+        """Return True while the frames of this system are held back."""
+        return self._receiver.is_held_back(system_id)
 
     def link_stalled(self, unsent_bytes: int) -> None:
         """Called when written data has stopped leaving this machine."""

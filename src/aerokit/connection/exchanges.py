@@ -11,6 +11,8 @@ from aerokit.connection.bus import copy_exception
 from aerokit.events import LinkSelected
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit.connection.connection import Connection
     from aerokit.mavlink.message import Message
     from aerokit.protocols.exchange import Exchange
@@ -23,7 +25,7 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
 
     Cancellation ends the exchange at once. Errors of sending, and the error that ends the connection, are raised.
     """
-    run = ExchangeRun(connection, exchange)
+    run = ExchangeRun(connection, exchange, is_held_back=partial(connection.is_held_back, system_id))
     with ExitStack() as attachments:
         for message_type in exchange.expects:
             attachments.callback(connection.bus.attach(message_type, run.receive, system_id=system_id))
@@ -36,11 +38,19 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
 class ExchangeRun(Generic[ResultT]):
     """Drives one exchange: sends its messages, and informs the exchange when a deadline has passed.
 
-    The owner calls :meth:`receive` with each message of the target, and :meth:`abort` when the connection ends.
+    The owner calls :meth:`receive` with each message of the target, and :meth:`abort` when the connection ends. While
+    ``is_held_back()`` is true, nothing is sent: the reopened link may lead to another vehicle.
     """
 
-    def __init__(self, connection: Connection, exchange: Exchange[ResultT]) -> None:
+    def __init__(
+        self,
+        connection: Connection,
+        exchange: Exchange[ResultT],
+        *,
+        is_held_back: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._connection, self._exchange = connection, exchange
+        self._is_held_back = is_held_back
         self._deadline: float | None = None  # loop time of the timer that is set; None if no timer is set
         # Set when the exchange is done or has failed.
         self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -88,7 +98,7 @@ class ExchangeRun(Generic[ResultT]):
         exchange = self._exchange
         try:
             for message in exchange.take_outbox():
-                if not self._connection._try_to_send(message):
+                if self._is_held_back() or not self._connection._try_to_send(message):
                     exchange.message_dropped()
         except Exception as error:  # The exchange ends, and result() raises this error.
             exchange.abort(error)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
+from aerokit.connection.bus import once
 from aerokit.connection.frame_observers import FrameObservers
 from aerokit.connection.heartbeats import discovery_event
 from aerokit.connection.loop_watch import IPYTHON_HINT, LoopWatch, is_unintegrated_ipython
@@ -17,7 +19,7 @@ from aerokit.mavlink.statistics import SourceLimit
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from aerokit.connection.bus import Bus
+    from aerokit.connection.bus import Bus, Detach
     from aerokit.connection.multilink.routes import MultiLinkRoutes
     from aerokit.connection.signatures import SignatureFilter
     from aerokit.mavlink.dialect import Dialect
@@ -155,6 +157,8 @@ class FrameReceiver:
         """Last HEARTBEAT of every (system id, component id) on the link."""
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
+        # Callbacks of `hold_back`, by system id.
+        self._held_back: dict[int, list[Callable[[Frame], object]]] = {}
         self._is_closed = False  # True once the connection has ended; frames are then dropped
         bus.must_check_frames = self._multilink is not None
         signatures.on_change = self._update_checks
@@ -176,6 +180,20 @@ class FrameReceiver:
     def reset(self) -> None:
         """Discard partial frames after the link was reopened."""
         self._peers.reset()
+
+    def hold_back(self, system_id: int, on_frame: Callable[[Frame], object]) -> Detach:
+        self._held_back.setdefault(system_id, []).append(on_frame)
+        self._update_checks()
+        return once(partial(self._deliver_again, system_id, on_frame))
+
+    def _deliver_again(self, system_id: int, on_frame: Callable[[Frame], object]) -> None:
+        self._held_back[system_id].remove(on_frame)
+        if not self._held_back[system_id]:
+            del self._held_back[system_id]
+        self._update_checks()
+
+    def is_held_back(self, system_id: int) -> bool:
+        return system_id in self._held_back
 
     def receive(self, data: bytes, peer: Peer) -> None:
         now = self._clock()
@@ -240,7 +258,9 @@ class FrameReceiver:
             if not multilink.accepts(frame, peer, framer.counters_of(frame)):
                 return False
             observers.record_received(frame.raw, self._clock())
-        return True
+        for on_frame in tuple(self._held_back.get(frame.system_id, ())):
+            on_frame(frame)
+        return frame.system_id not in self._held_back
 
     def arrived_at(self) -> float:
         """Return the receive time of the current frame. It is earlier than now if the frame may have waited."""
@@ -280,6 +300,7 @@ class FrameReceiver:
             self._is_closed
             or self._multilink is not None
             or not self._signatures.admits_all
+            or bool(self._held_back)
             or self.observers.want_all
             or len(self.framers) > 1
         )

@@ -26,7 +26,7 @@ from aerokit.fleets.separation import (
     separate_by_altitude,
     separate_by_time,
 )
-from aerokit.mavlink.enums import MavCmd, MavMissionType
+from aerokit.mavlink.enums import MavCmd
 from aerokit.missions.mission import Mission
 from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from aerokit.missions.item import MissionItem
-    from aerokit.vehicle.missions.context import PlanContext
 
 # Starts and targets may differ by this much from those of a plan, because vehicles drift and positions are noisy.
 MAX_PLAN_DRIFT_M = 3.0
@@ -364,7 +363,7 @@ class Missions(SelectionBase):
                     missions[member.name], timeout=timeout, max_distance_m=max_distance_m
                 )
                 # The plan may be replaced while other members still receive theirs.
-                uploaded_items[member.name] = _plans_of(member).caches[MavMissionType.MISSION].items
+                uploaded_items[member.name] = member.vehicle.mission._known_items
 
         result = await self._run("upload", upload, names=tuple(missions))
         result.raise_for_errors()
@@ -394,7 +393,7 @@ class Missions(SelectionBase):
         uploaded_items = self._context.uploaded_items
 
         def may_be_replaced(member: Member) -> bool:
-            return _plans_of(member).may_differ(MavMissionType.MISSION, uploaded_items[member.name])
+            return member.vehicle.mission._may_differ_from(uploaded_items[member.name])
 
         if replaced := [name for name in names if may_be_replaced(members[name])]:
             raise OperationRejected(
@@ -485,10 +484,6 @@ class Missions(SelectionBase):
         for member in members.values():
             self._check_available(member, "missions", "nothing was sent")
         return members
-
-
-def _plans_of(member: Member) -> PlanContext:
-    return member.vehicle.mission._context
 
 
 def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path:

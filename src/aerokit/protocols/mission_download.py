@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = ["DownloadResult", "MissionDownload"]
 
+# Maximum number of restarts without a new item.
 MAX_RESTARTS = 8
-# An answer that arrives sooner than this fraction of a round trip answers an earlier message.
-MIN_ROUND_TRIP_FRACTION = 0.8
 
 
 class DownloadResult(Snapshot):
@@ -84,6 +83,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._request_counts: dict[int, int] = {}
         self._busy_until: float | None = None
         self._restarts = 0
+        self._has_error = False  # True if the vehicle has sent ERROR since the last answer to a request
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -105,6 +105,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def expire(self, now: float) -> None:
         if self._is_idle(now):
             self._time_out(now)
+        elif self._has_error:
+            self._restart_after_error(now)
         elif self._count is None:
             self._attempt += 1
             self._request_list(now)
@@ -140,6 +142,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._count = message.count
         self._opaque_id = opaque_id
         self._busy_until = None
+        self._has_error = False
         self._indices = range(self._count) if self._only is None else [seq for seq in self._only if seq < self._count]
         self._report_progress(now, len(self._items), len(self._indices))
         self._proceed(now)
@@ -150,6 +153,9 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if self._request_counts[item.seq] == 1:  # The answer to a repeated request measures nothing.
             self.round_trip.add_sample(now - self._requested_at[item.seq])
         del self._requested_at[item.seq]
+        self._has_error = False
+        if item.seq not in self._items:
+            self._restarts = 0
         self._items[item.seq] = from_wire(item)
         self._report_progress(now, len(self._items), len(self._indices))
         self._proceed(now)
@@ -158,10 +164,9 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An ERROR that arrives too soon after the request for the list is ignored. It answers an earlier message,
-            # e.g. a repeated item of an upload.
-            if now - self._list_requested_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
-                self._restart_after_error(now)
+            # It may answer a late copy of an item that an earlier upload has sent. So it counts only if the request is
+            # not answered in time.
+            self._has_error = True
         elif result not in (
             MavMissionResult.ACCEPTED,
             MavMissionResult.INVALID_SEQUENCE,  # A MISSION_COUNT with the new number of items follows.
@@ -192,6 +197,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _restart(self, now: float) -> None:
         self._discard_requests()
         self._count = None
+        self._has_error = False
         self._attempt = 1
         self._received_at = now
         self._request_list(now)

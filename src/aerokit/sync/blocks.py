@@ -264,7 +264,9 @@ class ShieldedBlockTwin(TwinOf[ShieldedT]):
         try:
             self._loop.run_shielded(self.aio.__aexit__, exc_type, exc, traceback)
         except ConnectionClosed as error:
-            self.aio._abandon(error, exc)
+            from aerokit.vehicle.parameters.transaction import abandon
+
+            abandon(self.aio, error, exc)
 
 
 class TemporarilyTwin(ShieldedBlockTwin["TemporaryParameters"]):

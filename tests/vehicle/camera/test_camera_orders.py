@@ -255,6 +255,26 @@ async def test_refused_repetition_of_executed_order_is_no_refusal() -> None:
         assert effects == []
 
 
+async def test_order_without_effect_is_not_sent_again_after_reboot() -> None:
+    """Rule 3 of docs/reliability.md; after a lost link, the camera may even be another vehicle's."""
+    async with on_board(SimulatedCamera()) as vehicle:
+        await vehicle.camera.wait_found()
+        link = vehicle.camera._link
+        sent: list[int] = []
+
+        async def send() -> None:
+            sent.append(START_VIDEO)
+            vehicle._session.watch.reboots += 1
+            raise CommandTimeout("lost")
+
+        async def had_effect() -> bool:
+            return False
+
+        with pytest.raises(CommandTimeout, match="not sent again: the vehicle rebooted"):
+            await link.order_once(link.begin_order("video"), send, had_effect)
+        assert sent == [START_VIDEO]
+
+
 async def test_two_objects_of_a_camera_share_orders() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:

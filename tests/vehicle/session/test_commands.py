@@ -21,6 +21,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.events import VehicleRebooted
+from aerokit.mavlink import FrameEncoder, Message
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.sim import BootTimeline, ExtraComponent, SimulatedCopter
 
@@ -242,6 +243,23 @@ async def test_copy_of_ack_does_not_acknowledge_next_command(grounded: Flight) -
         tasks.start_soon(deliver_copy)
         with pytest.raises(CommandTimeout):
             await grounded.vehicle.command(SERVO, 9, 1100)
+
+
+async def test_equal_acks_of_component_with_constant_sequence_count(grounded: Flight) -> None:
+    """Its answers to two commands that are never repeated are as equal as copies, but its HEARTBEAT shows why."""
+
+    def send(message: Message) -> None:
+        grounded.wire.deliver(FrameEncoder(1, 100).encode(message))
+
+    async def answer() -> None:
+        await anyio.sleep(0.1)
+        send(m.Heartbeat(30, 8, 0, 0, 4))
+        send(m.CommandAck(MavCmd.IMAGE_START_CAPTURE, MavResult.ACCEPTED))
+
+    for _ in range(2):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(answer)
+            await grounded.vehicle.command(MavCmd.IMAGE_START_CAPTURE, component_id=100)
 
 
 async def test_ack_of_component_with_constant_sequence_counts_after_a_second(grounded: Flight) -> None:

@@ -73,13 +73,27 @@ class Stage:
                 _slept_since=lambda _: self.slept_s,
                 statistics=lambda: [SimpleNamespace(bytes=self.bytes)],
                 send=lambda message, to: self.sent.append(message),
+                hold_back=self._hold_back,
             ),
         )
+        self.held_back: Callable[[Frame], object] | None = None
         self.encoder = FrameEncoder(1, 1)
+
+    def _hold_back(self, _: int, on_frame: Callable[[Frame], object]) -> Callable[[], None]:
+        self.held_back = on_frame
+
+        def deliver_again() -> None:
+            self.held_back = None
+
+        return deliver_again
 
     def receive(self, message: Message, *, component_id: int = 1, received_at: float | None = None) -> None:
         encoder = self.encoder if component_id == 1 else FrameEncoder(1, component_id)
         (frame,) = Framer().receive(encoder.encode(message), self.at if received_at is None else received_at)
+        if self.held_back is not None:
+            self.held_back(frame)
+        if self.held_back is not None:
+            return
         for take in self.bus.takers.get(type(message), ()):
             take(frame)
         for sink in self.bus.sinks.get(type(message), ()):
@@ -108,6 +122,10 @@ class Watched(Stage):
 
     def _count(self) -> None:
         self.reported_reboots += 1
+
+    def lose_link(self) -> None:
+        (interrupt,) = self.bus.sinks[LinkInterrupted]
+        interrupt(LinkInterrupted(self.at, system_id=0, error=LinkLost("unplugged")))
 
     def clock(self, boot_ms: int, *, after: float = 0.1) -> int:
         self.at += after
@@ -165,6 +183,15 @@ def test_decreased_constant_time_is_no_reboot() -> None:
         assert stage.clock(5000) == 0
 
 
+def test_boot_clock_that_wraps_after_49_days_is_no_reboot() -> None:
+    stage, days = Watched(), 1 << 32
+    for running_ms in range(days - 2000, days + 20_000, 100):
+        assert stage.clock(running_ms % days) == 0
+    assert stage.boot_clocks[1, 1](stage.at) == 19_900
+    stage.clock(50)  # This is a reboot.
+    assert stage.clock(350, after=0.3) == 1
+
+
 def test_messages_of_other_components_are_ignored() -> None:
     stage = Watched()
     stage.clock(100_000)
@@ -214,8 +241,7 @@ def watched_without_link(speed: int = 1) -> Watched:
     stage = Watched()
     for running_s in (40, 50):
         stage.clock(1000 * running_s * speed, after=10.0)
-    (interrupt,) = stage.bus.sinks[LinkInterrupted]
-    interrupt(LinkInterrupted(stage.at, system_id=0, error=LinkLost("unplugged")))
+    stage.lose_link()
     return stage
 
 
@@ -243,8 +269,7 @@ def test_late_message_before_lost_link_is_no_reboot(first_late_s: float, last_wa
     received_at = stage.at + 0.1
     stage.at = received_at + last_waited_s
     stage.receive(attitude(round(1000 * received_at)), received_at=received_at)
-    (interrupt,) = stage.bus.sinks[LinkInterrupted]
-    interrupt(LinkInterrupted(stage.at, system_id=0, error=LinkLost("unplugged")))
+    stage.lose_link()
     stage.at += 60.0
     assert [stage.clock(round(1000 * stage.at) + 100) for _ in range(20)] == [0] * 20
 
@@ -267,6 +292,39 @@ def test_backlog_after_lost_link_is_no_reboot() -> None:
     for number in range(30):
         assert stage.clock(50_000 + 1100 * number) == 0
     assert [stage.clock(83_100 + 100 * number) for number in range(20)] == [0] * 20
+
+
+@pytest.mark.parametrize("observed_s", [0.9, 1.1])
+def test_lost_link_soon_after_connect_real_time_is_recognised(observed_s: float) -> None:
+    stage = Watched()
+    stage.clock(100_000)
+    stage.clock(100_000 + round(1000 * observed_s), after=observed_s)
+    stage.lose_link()
+    assert stage.clock(110_000 + round(1000 * observed_s), after=10.0) == (observed_s < 1.0)
+
+
+def test_lost_link_without_clock_afterwards_is_reboot() -> None:
+    stage = watched_without_link()
+    for at in (10.0, 5.0, 0.1):
+        stage.at += at
+        stage.receive(HEARTBEAT)
+        stage.watch.check()
+        assert stage.watch.reboots == (at == 0.1)
+    assert stage.watch.last_heartbeat_at < 20.0  # Until then, no message counts.
+
+
+@pytest.mark.parametrize(("booted_at", "reboots"), [(0.0, 0), (-1.7e9, 1)])
+def test_timesync_answer_shows_same_boot_after_lost_link(booted_at: float, reboots: int) -> None:
+    """The time of day shows nothing, because all vehicles have the same."""
+    stage = Watched()
+    for _ in range(2):
+        stage.at += 10.0
+        stage.receive(Timesync(round((stage.at - booted_at) * 1e9), 5))
+    stage.lose_link()
+    stage.at += 10.0
+    stage.receive(Timesync(round((stage.at - booted_at) * 1e9), 5))
+    stage.receive(HEARTBEAT)
+    assert (stage.watch.reboots, stage.watch.last_heartbeat_at) == (reboots, stage.at)
 
 
 def test_timesync_request_of_vehicle_is_ignored() -> None:
@@ -349,6 +407,17 @@ def test_round_trip_uses_first_answer() -> None:
     stage.receive(answer)  # a second copy of it
     assert stage.watch.round_trip_s == pytest.approx(0.1)
     assert stage.answers == [(5.0, 77)]
+
+
+def test_round_trip_without_further_answers_is_unknown_again() -> None:
+    stage = Measured()
+    question = stage.request_time()
+    stage.at = 1.0
+    stage.receive(Timesync(77_000_000, question.ts1))
+    reported = []
+    for stage.at in (10.0, 10.1):  # The report follows a second later.
+        reported.append(stage.report((0, 0), 0).round_trip_s)
+    assert reported == [1.0, None]
 
 
 def test_loss_and_rates_of_a_second() -> None:

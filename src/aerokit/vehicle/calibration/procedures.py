@@ -13,7 +13,7 @@ import anyio
 from aerokit.errors import AerokitError, NotSupported, OperationTimeout, ParameterRejected
 from aerokit.mavlink.enums import AccelcalVehiclePos, MagCalStatus, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import CommandLong, MagCalProgress, MagCalReport
-from aerokit.vehicle.calibration.run import logger
+from aerokit.vehicle.calibration.run import CancelCommand, logger
 from aerokit.vehicle.calibration.values import CalibrationPose, CompassFit, parse_report
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.calibration.run import CalibrationRun
     from aerokit.vehicle.calibration.values import CalibrationReport, CalibrationStep
 
-CANCEL_ALL = (MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 0, 0, 0)
+CANCEL_ALL = CancelCommand(MavCmd.PREFLIGHT_CALIBRATION, (0, 0, 0, 0, 0, 0, 0))
 ALL_COMPASSES = 0  # as a bit mask
 REPORT_HZ = 4.0
 # Value of ESC_CALIBRATION with which ArduCopter calibrates the ESCs at its next boot.
@@ -171,7 +171,7 @@ async def _read_parameter(run: CalibrationRun, name: str) -> float:
 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    await run.begin((MavCmd.DO_CANCEL_MAG_CAL, ALL_COMPASSES))
+    await run.begin(CancelCommand(MavCmd.DO_CANCEL_MAG_CAL, (ALL_COMPASSES,)))
     percents: dict[int, int] = {}  # progress in percent by number of the compass
     reports: dict[int, MagCalReport] = {}  # final report by number of the compass
     has_news = asyncio.Event()  # set when a report or another progress has arrived
@@ -326,7 +326,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     values = _radio_parameters(run, ranges)
     async with run.parameters().transaction() as transaction:
         await transaction.set_many(values)
-    await run.command(*CANCEL_ALL, accepts=RADIO_COMMAND_RESULTS)
+    await run.command(CANCEL_ALL.command, *CANCEL_ALL.params, accepts=RADIO_COMMAND_RESULTS)
     yield run.result(f"{len(moved)} channels were calibrated")
 
 

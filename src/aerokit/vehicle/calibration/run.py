@@ -7,7 +7,7 @@ import logging
 import math
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import anyio
 import anyio.lowlevel
@@ -47,6 +47,13 @@ MAX_CANCEL_ATTEMPTS, CANCEL_INTERVAL_S = 6, 2.5
 CONFIRM_POLL_INTERVAL_S = 0.1
 
 
+class CancelCommand(NamedTuple):
+    """The command that cancels a calibration."""
+
+    command: int
+    params: tuple[float, ...]
+
+
 class CalibrationRun:
     """One calibration, which counts as running from its first command until ``finish`` or a confirmed cancellation."""
 
@@ -60,7 +67,7 @@ class CalibrationRun:
         self.call_name: str = f"calibrate.{sensor}"  # how error texts name the call
         self._runs = runs  # all runs of this vehicle that may be in progress
         self.new_step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
-        self._cancel_command: tuple[float, ...] | None = None  # MAV_CMD and its parameters
+        self._cancel_command: CancelCommand | None = None
         self._cannot_cancel_reason = ""  # why the calibration cannot be cancelled, for the user; empty if it can be
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
@@ -83,11 +90,11 @@ class CalibrationRun:
             )
         self.session.check_disarmed(self.call_name, is_state_recent=self.context.arbiter.is_state_recent)
 
-    async def begin(self, cancel: tuple[float, ...] | None, cannot_cancel_reason: str = "") -> None:
+    async def begin(self, cancel: CancelCommand | None, cannot_cancel_reason: str = "") -> None:
         """Register this calibration as running, once the cancellation of earlier ones has ended.
 
-        ``cancel`` is the command that cancels this calibration, with its parameters; None if there is none. Raises
-        BusyError if another calibration is in progress.
+        ``cancel`` is None if no command cancels this calibration. Raises BusyError if another calibration is in
+        progress.
         """
         self.check_ready()
         # A deleted `Calibration` abandons its run in the next iteration of the event loop, so wait for that.
@@ -156,7 +163,7 @@ class CalibrationRun:
         order = self._cleanup.enter_context(arbiter.auxiliary_order(ends_with_actions=False))
         sent_command = self._cleanup.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
-            self._send_cancel(*self._cancel_command)
+            self._send_cancel(self._cancel_command)
         self._is_unconfirmed = True
         self.session.background.start(lambda: self._confirm_cancel(sent_command), "aerokit calibration")
 
@@ -176,11 +183,11 @@ class CalibrationRun:
                 f"{self.call_name}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
             )
 
-    def _send_cancel(self, command: float, *params: float) -> None:
+    def _send_cancel(self, cancel: CancelCommand) -> None:
         # The callers have checked that the vehicle is not silent. It may receive this command twice without harm.
         self._cancel_sent_at = self.session.connection.now()
-        self.session.commands.forget_result(int(command))
-        self.session.commands.send_unconfirmed(int(command), *params)
+        self.session.commands.forget_result(cancel.command)
+        self.session.commands.send_unconfirmed(cancel.command, *cancel.params)
 
     async def _confirm_cancel(self, sent_command: SentCommand) -> None:
         assert self._cancel_command is not None
@@ -198,13 +205,15 @@ class CalibrationRun:
                         return
                     if not self.context.arbiter.is_state_recent:
                         continue
-                    self._send_cancel(*self._cancel_command)
+                    self._send_cancel(self._cancel_command)
                 with anyio.move_on_after(CANCEL_INTERVAL_S):
                     while not self._is_cancel_confirmed():  # noqa: ASYNC110
                         await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
                     self._is_unconfirmed = False
                     return
             logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)
+        except OperationRejected:  # The reopened link may lead to another vehicle.
+            self._is_unconfirmed = False
         except (ConnectionClosed, LinkLost):  # The vehicle can no longer be reached.
             pass
         finally:
@@ -215,7 +224,7 @@ class CalibrationRun:
             return True
         assert self._cancel_command is not None
         assert self._cancel_sent_at is not None
-        command = int(self._cancel_command[0])
+        command = self._cancel_command.command
         if command != MavCmd.PREFLIGHT_CALIBRATION:
             return self.session.commands.accepted_at(command) >= self._cancel_sent_at
         # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.

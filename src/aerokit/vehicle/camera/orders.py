@@ -15,7 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.protocols.command import command_name
-from aerokit.vehicle.commanding.order import SUPERSEDED
+from aerokit.vehicle.commanding.order import REBOOTED, SUPERSEDED
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -111,6 +111,16 @@ class CameraOrders:
         """Return the key of one function, such as ``"video"``. A new order replaces earlier ones with its key."""
         return ("camera", self.component.component_id, self.device_id, subject)
 
+    @property
+    def reboots(self) -> int:
+        """Number of reboots of the vehicle so far. After a reboot, no order is repeated."""
+        return self._session.watch.reboots
+
+    @property
+    def other_boots(self) -> int:
+        """Number of these after which the reopened link may lead to another vehicle."""
+        return self._session.watch.other_boots
+
     def begin_order(self, subject: str) -> Order:
         return self._context.arbiter.device_order(self._ordered_topic(subject), may_be_withdrawn=True)
 
@@ -177,8 +187,10 @@ class CameraOrders:
     ) -> None:
         """Send an order. It is sent again only if the camera reports that it had no effect.
 
-        ``check_effect`` asks the camera, and returns None if there is no answer. A newer order ends the retries.
+        ``check_effect`` asks the camera, and returns None if there is no answer. A newer order and a reboot of the
+        vehicle end the retries.
         """
+        reboots = self.reboots
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
                 await send()
@@ -191,8 +203,10 @@ class CameraOrders:
             except CommandTimeout as error:
                 error.was_sent = error.was_sent or attempt > 1
                 had_effect = await check_effect() if order.is_newest else None
-                if not order.is_newest:  # A newer order may have been given while the camera was asked.
-                    error.args = (f"{error}; not sent again: {SUPERSEDED}",)
+                # A newer order may have been given while the camera was asked.
+                if not order.is_newest or self.reboots != reboots:
+                    reason = SUPERSEDED if not order.is_newest else REBOOTED
+                    error.args = (f"{error}; not sent again: {reason}",)
                     raise
                 if had_effect:
                     return

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, OperationRejected
 from aerokit.protocols.command import MAX_HEARTBEAT_AGE_S
-from aerokit.vehicle.commanding.order import SUPERSEDED, Order, SentCommand
+from aerokit.vehicle.commanding.order import REBOOTED, SUPERSEDED, Order, SentCommand
+from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -51,9 +52,15 @@ class CommandArbiter:
     """
 
     def __init__(
-        self, now: Callable[[], float], telemetry: Telemetry, slept_since: Callable[[float], float] = lambda _: 0.0
+        self,
+        now: Callable[[], float],
+        telemetry: Telemetry,
+        slept_since: Callable[[float], float] = lambda _: 0.0,
+        is_held_back: Callable[[], bool] = lambda: False,
     ) -> None:
         self._now, self._telemetry = now, telemetry
+        # Returns True while the link was lost, until the vehicle has proved that it is the same boot.
+        self._is_held_back = is_held_back
         # Returns how many seconds the computer has slept since the given time.
         self.slept_since = slept_since
         self.newest: Order | None = None
@@ -197,8 +204,9 @@ class CommandArbiter:
             callback()
 
     def on_reboot(self) -> None:
+        reason = OTHER_BOOT if self._is_held_back() else REBOOTED
         for order in (*self._orders_in_progress, *self._posted_orders):
-            order.on_reboot()
+            order.end_by_reboot(reason)
         self._ordered_since_disarmed.clear()
         self._arming_order = None
         self.last_arming_at = math.inf  # Until the vehicle arms again, `current` ignores all orders.
@@ -377,7 +385,7 @@ class CommandArbiter:
     @property
     def is_state_recent(self) -> bool:
         self.slept_since(self._now())  # If the computer has just slept, this call adds the sleep to all ages.
-        return self._telemetry.armed.age <= MODE_MAX_AGE_S
+        return self._telemetry.armed.age <= MODE_MAX_AGE_S and not self._is_held_back()
 
     @property
     def mode_is_in_doubt(self) -> bool:

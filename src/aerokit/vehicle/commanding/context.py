@@ -35,7 +35,12 @@ class VehicleContext:
     def __init__(self, session: VehicleSession) -> None:
         self.session = session
         connection = session.connection
-        self.arbiter: CommandArbiter = CommandArbiter(connection.now, session.telemetry, connection._slept_since)
+        self.arbiter: CommandArbiter = CommandArbiter(
+            connection.now,
+            session.telemetry,
+            connection._slept_since,
+            partial(connection.is_held_back, session.system_id),
+        )
         self.sender: OrderSender = OrderSender(session, self.arbiter)
         self.flight_cleanup: FlightCleanup = FlightCleanup(session, self.arbiter, self.sender)
         self.arm_cleanup: ArmCleanup = ArmCleanup(session, self.arbiter, self.sender)
@@ -43,7 +48,8 @@ class VehicleContext:
         self.vehicle_position: VehiclePosition = VehiclePosition(session)
         self.finish_callbacks: list[Callable[[], None]] = []
         """Callbacks of :meth:`on_finish`, in the order in which they were added."""
-        session.on_reboot.append(self.arbiter.on_reboot)
+        # After a reboot, no earlier command arms the vehicle.
+        session.on_reboot += [self.arbiter.on_reboot, self.arm_cleanup.stop_watching]
 
     def on_finish(self, callback: Callable[[], None]) -> Detach:
         """Call ``callback`` at the end of the vehicle's `async with` block. Returns a function that removes it.

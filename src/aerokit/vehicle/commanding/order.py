@@ -30,6 +30,8 @@ HOME: Topic = "home position"
 
 SUPERSEDED = "another order was given"
 """Reason for the end of an order that a newer order replaced."""
+REBOOTED = "the vehicle rebooted"
+"""Reason for the end of an order by a reboot."""
 
 # A new mode also changes how the vehicle moves.
 _MODE: tuple[Subject, ...] = ("mode", "motion")
@@ -308,8 +310,8 @@ class Order:
         elif armed_before and not armed and self._ends_on_disarm:
             self.takeover_reason = self.takeover_reason or "the vehicle disarmed"
 
-    def on_reboot(self) -> None:
-        self.takeover_reason = self.takeover_reason or "the vehicle rebooted"
+    def end_by_reboot(self, reason: str) -> None:
+        self.takeover_reason = self.takeover_reason or reason
 
 
 class SentCommand:

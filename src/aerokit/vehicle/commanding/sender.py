@@ -174,7 +174,8 @@ class OrderSender:
     def _error_without_answer(self, error: CommandTimeout, order: Order, sent: SentCommand | None) -> Exception:
         """Return OperationRejected if a newer order or another party ended the wait for the answer, else ``error``."""
         if order.takeover_reason or (order.failsafe and order.end):  # Another party has ended the order.
-            return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
+            text = str(error) if order.end in str(error) else f"{error}; {order.end}"
+            return OperationRejected(text, reasons=self._session.texts_since(order.given_at))
         # A command to arm is overruled by one to disarm, and the reverse.
         is_overruled = sent is not None and sent.end == SUPERSEDED and order.is_newest
         if is_overruled or self._arbiter.is_replaced(order):

@@ -140,7 +140,9 @@ class ValueStream(Generic[ValueT]):
             self._stop(reason)
             return
         try:
-            self._send()
+            # The reopened link may lead to another vehicle.
+            if not self._session.connection.is_held_back(self._session.system_id):
+                self._send()
         except Exception as error:
             self._stop(str(error) or repr(error))
             assert self._stop_error is not None

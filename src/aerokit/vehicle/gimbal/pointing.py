@@ -18,7 +18,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import GimbalDeviceFlags, MavMountMode
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.commanding.order import SUPERSEDED
+from aerokit.vehicle.commanding.order import REBOOTED, SUPERSEDED
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, POLL_INTERVAL_S, POSITION_MAX_AGE_S, ChangeSignal
 from aerokit.vehicle.gimbal.device import YawFrame, information_of
 from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, GimbalMixin
@@ -154,7 +154,7 @@ async def wait_until_reached(
             session.end.raise_if_ended()
             has_rebooted = orders.public_device.reboots != reboots_before
             if not order.is_newest or has_rebooted:
-                reason = "the vehicle rebooted" if has_rebooted else SUPERSEDED
+                reason = REBOOTED if has_rebooted else SUPERSEDED
                 raise OperationRejected(f"{description}: {reason}")
             orders.raise_if_taken()
             orders.raise_if_refused(description, accepted_at)

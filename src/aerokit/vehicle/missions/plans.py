@@ -11,9 +11,10 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Sequence
 
     from aerokit.missions import Fence, RallyPoints
+    from aerokit.missions.item import MissionItem
     from aerokit.protocols.exchange import OnProgress
     from aerokit.vehicle.missions.context import PlanContext, PlanVersion
     from aerokit.vehicle.missions.transfer import PlanProtocol, PlanTransfer
@@ -126,6 +127,15 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
     @property
     def _version(self) -> PlanVersion:
         return self._context.version(self._get_plan_type().MISSION_TYPE)
+
+    @property
+    def _known_items(self) -> tuple[MissionItem, ...] | None:
+        """The items that the vehicle had after the last transfer; None if they may have been replaced since."""
+        return self._context.caches[self._get_plan_type().MISSION_TYPE].items
+
+    def _may_differ_from(self, uploaded_items: Sequence[MissionItem] | None) -> bool:
+        """Return True if the vehicle may have other items now than ``uploaded_items``, its `_known_items` of before."""
+        return self._context.may_differ(self._get_plan_type().MISSION_TYPE, uploaded_items)
 
     def _get_plan_type(self) -> type[PlanT]:
         """Return the class of the plan, imported on demand."""

@@ -315,6 +315,14 @@ class Transaction(_Block):
             super()._abandon(error, cause)
 
 
+def abandon(block: TemporaryParameters | Transaction, error: AerokitError, cause: BaseException | None) -> None:
+    """End a block whose connection has ended with its loop (``error``), and raise what its end would raise.
+
+    ``cause`` is the exception that has left the block, or None.
+    """
+    block._abandon(error, cause)
+
+
 def _raise_first_error(results: Mapping[str, ParameterWrite]) -> None:
     for result in results.values():
         if result.error is not None:

@@ -33,6 +33,8 @@ PENDING_ACK_TIMEOUT_S = 2.0
 # repeat after 256 frames, so that a new ack is equal by chance only if the vehicle sends more than 256 frames a second.
 COPY_WINDOW_S = 1.0
 MAX_RECENT_ACKS = 16
+# A HEARTBEAT of the last seconds has another sequence number than an ack, unless the sender does not count its frames.
+HEARTBEAT_WINDOW_S = 2.0
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""
@@ -226,8 +228,9 @@ class CommandSender:
         self._accepted_at.pop(key, None)
 
     def forget_results(self) -> None:
-        # A rebooted vehicle may support other commands.
+        # A rebooted vehicle may support other commands, and does not execute those from before.
         self._results.clear()
+        self._accepted_at.clear()
 
     async def _run(self, message: CommandLong | CommandInt, options: _Options) -> CommandAck:
         """Send a command and return its ACCEPTED ack. Waits for earlier calls of the same command."""
@@ -327,10 +330,18 @@ class CommandSender:
     def _is_copy(self, frame: Frame) -> bool:
         """Record an ack's frame. Return True if an equal frame has just arrived, because the link duplicates frames."""
         earliest = frame.received_at - COPY_WINDOW_S
-        is_copy = any(ack.body == frame.body and ack.received_at >= earliest for ack in self._recent_acks)
-        if not is_copy:  # If copies were recorded, all acks with a constant sequence number would count as copies.
-            self._recent_acks.append(frame)
-        return is_copy
+        is_equal = any(ack.body == frame.body and ack.received_at >= earliest for ack in self._recent_acks)
+        if is_equal and not self._has_constant_sequence(frame):
+            return True  # A copy is not recorded, because it would prolong the time in which others count as copies.
+        self._recent_acks.append(frame)
+        return False
+
+    def _has_constant_sequence(self, ack: Frame) -> bool:
+        """Return True if the sender does not count its frames, so that its equal acks need not be copies."""
+        heartbeat = self._connection.heartbeats.get((ack.system_id, ack.component_id))
+        frame = None if heartbeat is None else heartbeat.received_frame
+        is_recent = frame is not None and ack.received_at - frame.received_at <= HEARTBEAT_WINDOW_S
+        return is_recent and frame is not None and frame.sequence == ack.sequence
 
     def _on_ack(self, ack: CommandAck) -> None:
         frame = ack.received_frame

@@ -42,7 +42,7 @@ from aerokit.vehicle.session.commands import CommandSender
 from aerokit.vehicle.session.rates import MessageRates
 from aerokit.vehicle.session.subscriber import ComponentSubscriber, WatchedStream
 from aerokit.vehicle.session.transfers import Transfers
-from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
+from aerokit.vehicle.session.watch import OTHER_BOOT, LinkWatch, VehicleWatch
 from aerokit.vehicle.state.field import MESSAGE_IDS
 from aerokit.vehicle.state.states import STATES
 from aerokit.vehicle.state.telemetry import Telemetry
@@ -269,7 +269,11 @@ class VehicleSession:
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
-        """Wait for a HEARTBEAT received after ``since``, by default after this call."""
+        """Wait for a HEARTBEAT received after ``since``, by default after this call.
+
+        Raises OperationRejected if a link was reopened meanwhile that may lead to another vehicle.
+        """
+        other_boots = self.watch.other_boots
         # Every HEARTBEAT updates `armed`.
         armed = self.telemetry.armed
         start = self.connection.now() if since is None else since
@@ -277,6 +281,8 @@ class VehicleSession:
         await armed.wait_until(
             lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
         )
+        if self.watch.other_boots != other_boots:
+            raise OperationRejected(f"{OTHER_BOOT}; nothing was sent to it")
 
     def is_answer(self, ack: CommandAck, command: int) -> bool:
         frame = ack.received_frame
@@ -365,7 +371,7 @@ class VehicleSession:
         self.add_timeout_hint(*self.telemetry.cells.values(), self.link_quality, self.watch.link_state)
         self._detach_callbacks += [
             *self._publish_changes(),
-            bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
+            bus.attach_event(LinkRestored, self._on_link_restored),
             bus.attach_event(LinkSelected, self._on_link_selected),
             bus.attach_event(ComputerSlept, self._on_computer_slept),
             self.connection.on_end(self._on_end),
@@ -414,6 +420,11 @@ class VehicleSession:
         if event.system_id == self.system_id and event.before is not None:
             self.rates.request_again()
 
+    def _on_link_restored(self, event: LinkRestored) -> None:
+        self.rates.request_again()
+        # The answers show whether it is the same boot of the same vehicle.
+        self.link_watch.request_time()
+
     def _on_computer_slept(self, event: ComputerSlept) -> None:
         # The loop's clock stood still while the computer slept, so the ages do not include this time yet.
         self.watch.last_heartbeat_at -= event.seconds
@@ -428,6 +439,8 @@ class VehicleSession:
 
     def _on_second(self) -> None:
         self.watch.check()
+        if self.connection.is_held_back(self.system_id):
+            self.link_watch.request_time()
         self.telemetry.expire(self.connection.now())
 
     async def _learn_constants(self) -> None:

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.errors import NotSupported, OperationTimeout
+from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
 from aerokit.mavlink.messages import SetupSigning
+from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
@@ -29,10 +30,14 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
     """Send SETUP_SIGNING until the vehicle signs with the key. With None, until the vehicle no longer signs."""
     _check_vehicle(session)
     connection, started = session.connection, session.connection.now()
+    other_boots = session.watch.other_boots
     with connection._signatures.key_handover(signing, session.system_id, session.component_id) as has_accepted:
         with anyio.move_on_after(timeout):
             while not has_accepted.is_set():
-                session.send(_message(session, signing))
+                if session.watch.other_boots != other_boots:
+                    raise OperationRejected(f"setup_signing: {OTHER_BOOT}; the first may have taken the key")
+                if not connection.is_held_back(session.system_id):
+                    session.send(_message(session, signing))
                 with anyio.move_on_after(RETRY_INTERVAL_S):
                     await has_accepted.wait()
                 connection.raise_if_ended()

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import anyio
 
 from aerokit.connection.exchanges import run_exchange
-from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, OperationTimeout
+from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, OperationRejected, OperationTimeout
+from aerokit.events import VehicleRebooted
 from aerokit.protocols.exchange import RoundTrip, Transfer, TransferProgress
+from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -113,27 +115,42 @@ class Transfers:
         """Run one exchange to its end and return its result.
 
         Cancellation ends the exchange at once. Raises :class:`OperationTimeout` after ``timeout`` seconds, or when the
-        exchange itself times out.
+        exchange itself times out, and :class:`OperationRejected` if it spans a lost link after which the vehicle is not
+        in the same boot.
         """
         self._end.raise_if_ended()
+        connection, has_changed_boot = self.connection, False
+        was_held_back = connection.is_held_back(self.system_id)  # Nothing was exchanged then.
+
+        def on_reboot(event: VehicleRebooted) -> None:
+            nonlocal has_changed_boot
+            if event.system_id == self.system_id and connection.is_held_back(self.system_id) and not was_held_back:
+                has_changed_boot = True
+                scope.cancel()
+
         with self.limit(timeout), anyio.CancelScope() as scope:
             if isinstance(exchange, Transfer) and exchange.on_progress is not None:
                 exchange.on_progress = _without_errors(exchange.on_progress)
-            detach = self._end.on_end(lambda _: scope.cancel())
+            detachers = [
+                self._end.on_end(lambda _: scope.cancel()),
+                connection.bus.attach_event(VehicleRebooted, on_reboot),
+            ]
             try:
-                result = await run_exchange(self.connection, self.system_id, exchange)
+                result = await run_exchange(connection, self.system_id, exchange)
             except OperationTimeout as error:
                 self._append_link_description(error)
                 raise
             finally:
-                detach()
+                for detach in detachers:
+                    detach()
             if isinstance(result, dict):  # A request for several names returns one value or exception for each name.
                 for answer in result.values():
                     if isinstance(answer, OperationTimeout):
                         self._append_link_description(answer)
             return result
-        self._end.raise_if_ended()  # Only the end of the session cancels `scope`.
-        raise AssertionError("the exchange was cancelled, but the session has not ended")
+        self._end.raise_if_ended()
+        assert has_changed_boot  # Only this and the end of the session cancel `scope`.
+        raise OperationRejected(f"the transfer has ended: {OTHER_BOOT}")
 
     def _append_link_description(self, error: OperationTimeout) -> None:
         error.args = (f"{error}; {self._describe()}",)

@@ -45,11 +45,22 @@ EXPECTED_REBOOT_MIN_LAG_MS = 2000
 # RESUME_CONFIRM_S, because the first messages may be late.
 RESUME_TOLERANCE_S, RESUME_TOLERANCE_RATIO = 1.5, 0.05
 RESUME_CONFIRM_S = 1.0
+# If the vehicle sends no time since boot for this many seconds after its first message, it counts as rebooted.
+RESUME_TIMEOUT_S = 5.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
 # many seconds apart.
 CLOCK_SPAN_S = 5.0
+# A greater time, in TIMESYNC answers of other firmware, is the time of day, which is the same on all vehicles.
+MAX_RUNNING_TIME_MS = 100_000_000_000
+# A clock that keeps real time to within this fraction for at least this many seconds is not that of a fast simulation.
+REAL_TIME_SPAN_S, REAL_TIME_TOLERANCE_RATIO = 1.0, 0.1
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
+# A round trip is unknown again after this many seconds without an answer to TIMESYNC. The link may have changed.
+ROUND_TRIP_MAX_AGE_S = 10.0
+BOOT_CLOCK, BOOT_CLOCK_RANGE_MS = "time_boot_ms", 1 << 32
+OTHER_BOOT = "the reopened link does not lead to the same boot of the same vehicle, as far as its clock shows"
+"""Error text about a vehicle that has not proved, after the link was reopened, to be in the same boot."""
 # Maximum number of unanswered TIMESYNC requests; older ones are considered lost.
 MAX_OPEN_REQUESTS = 64
 
@@ -107,33 +118,42 @@ class VehicleWatch:
         self._has_ended = False
         self.reboots: int = 0
         """Number of reboots detected."""
+        self.other_boots: int = 0
+        """Number of these after which the reopened link may lead to another vehicle."""
         self._last_readings: dict[str, _ClockReading] = {}
-        # The first reading of ``time_boot_ms`` since the start of the session or a reboot.
-        self._first_reading: _ClockReading | None = None
+        # The first reading of each clock since the start of the session or a reboot.
+        self._first_readings: dict[str, _ClockReading] = {}
         # The connection uses this clock to recognise a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # The lowest reading of each clock that has decreased, until `_is_decrease_confirmed` knows whether this is a
         # The lowest reading of each decreased clock, until `_is_decrease_confirmed` decides if it shows a reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
-        # ``time_boot_ms`` when the link was lost; None once a later reading has continued it.
-        self._lost_clock: _LostClock | None = None
-        # The first reading since the link was lost that does not continue ``_lost_clock``; None if there is none.
-        self._resumed_reading: _ClockReading | None = None
+        # Ends the time from the loss of the link until the vehicle's clock has proved that it is the same boot of the
+        # same vehicle. None if there is no such time.
+        self._deliver_again: Detach | None = None
+        # The clocks when the link was lost, as far as their speed was known.
+        self._lost_clocks: dict[str, _LostClock] = {}
+        # The first reading of each clock since then that does not continue the clock.
+        self._resumed_readings: dict[str, _ClockReading] = {}
+        # Time of the last of these readings, or of the first frame since then; None before it.
+        self._unproved_since: float | None = None
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
         # The vehicle's time in the last answer to a TIMESYNC request.
         self._last_answer = _ClockReading(0, read_at=-math.inf)
-        attach = connection.bus.attach
-        self._detach_callbacks: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
-        attach_frames = connection.bus.attach_frames
+        bus = connection.bus
+        self._detach_callbacks: list[Detach] = [
+            bus.attach(Heartbeat, self._on_heartbeat, system_id=system_id),
+            bus.attach_event(LinkInterrupted, self._on_link_interrupted),
+        ]
+        self._clock_handlers: dict[int, Callable[[Frame], None]] = {}
         for message_type, handler in (
             (Attitude, self._on_boot_time),
             (GlobalPositionInt, self._on_boot_time),
             (SystemTime, self._on_system_time),
+            (Timesync, self._on_timesync),
         ):
-            self._detach_callbacks.append(attach_frames(message_type, handler, system_id=system_id))
-        self._detach_callbacks.append(attach(Timesync, self._on_timesync, system_id=system_id))
-        self._detach_callbacks.append(connection.bus.attach_event(LinkInterrupted, self._on_link_interrupted))
+            self._clock_handlers[message_type.ID] = handler
+            self._detach_callbacks.append(bus.attach_frames(message_type, handler, system_id=system_id))
 
     @property
     def is_silent(self) -> bool:
@@ -154,27 +174,24 @@ class VehicleWatch:
 
     def close(self) -> None:
         self._connection.boot_clocks.pop((self._system_id, self._component_id), None)
+        self._end_proof()
         for detach in self._detach_callbacks:
             detach()
 
     def boot_time_ms(self, now: float) -> float | None:
         """Return the vehicle's time since boot at ``now``, or None if it is unknown."""
-        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
-        if first is None or last is None:
+        last = self._last_readings.get(BOOT_CLOCK)
+        if last is None or BOOT_CLOCK not in self._first_readings:
             return None
-        return last.milliseconds + self._clock_speed() * (now - last.read_at)
+        return (last.milliseconds + self._clock_speed() * (now - last.read_at)) % BOOT_CLOCK_RANGE_MS
 
-    def _clock_speed(self) -> float:
-        """Return how many milliseconds the vehicle's clock advances in a second."""
-        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
+    def _clock_speed(self, clock: str = BOOT_CLOCK) -> float:
+        """Return how many milliseconds this clock of the vehicle advances in a second."""
+        first, last = self._first_readings.get(clock), self._last_readings.get(clock)
         # The clock of a simulation may be faster than real time.
-        if first is None or last is None or self._clock_span_s() <= CLOCK_SPAN_S:
+        if first is None or last is None or last.read_at - first.read_at <= CLOCK_SPAN_S:
             return 1000.0
-        return (last.milliseconds - first.milliseconds) / self._clock_span_s()
-
-    def _clock_span_s(self) -> float:
-        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
-        return 0.0 if first is None or last is None else last.read_at - first.read_at
+        return (last.milliseconds - first.milliseconds) / (last.read_at - first.read_at)
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
@@ -193,13 +210,15 @@ class VehicleWatch:
             return
         self._last_answer = _ClockReading(milliseconds, self._connection.now())
         if milliseconds < previous.milliseconds:
-            self._on_reboot_detected("TIMESYNC", milliseconds)
+            self._on_reboot_detected({"TIMESYNC": self._last_answer})
 
     def check(self) -> None:
         """Publish VehicleSilent if heartbeats have stopped. Called once a second."""
         now = self._connection.now()
         silent_for = self.silent_for_s
         self._state_tracker.check(now)
+        if self._unproved_since is not None and now - self._unproved_since > RESUME_TIMEOUT_S:
+            self._on_reboot_detected({})
         if silent_for > SILENT_AFTER_S and not self._is_reported_silent:
             self._is_reported_silent = True
             self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
@@ -219,31 +238,62 @@ class VehicleWatch:
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
         self._state_tracker.mark_lost(event.at)
-        self._resumed_reading = None
-        first, last = self._first_reading, self._last_readings.get("time_boot_ms")
-        # If `_lost_clock` is set, the link was lost a second time before the clocks were compared.
-        if self._lost_clock is not None or first is None or last is None:
+        self._resumed_readings, self._unproved_since = {}, None
+        if self._deliver_again is not None:  # The link was lost again before the clocks were compared.
             return
-        min_span_s = self._clock_span_s() - last.waited_s
+        lost_clocks = {clock: self._lost_clock(clock) for clock in self._first_readings}
+        self._lost_clocks = {clock: lost for clock, lost in lost_clocks.items() if lost is not None}
+        self._deliver_again = self._connection.hold_back(self._system_id, self._on_unproved_frame)
+
+    def _lost_clock(self, clock: str) -> _LostClock | None:
+        """Return what is known about a clock when the link is lost; None if its speed is unknown."""
+        first, last = self._first_readings[clock], self._last_readings[clock]
+        if last.milliseconds > MAX_RUNNING_TIME_MS:
+            return None
+        min_span_s = last.read_at - first.read_at - last.waited_s
         if min_span_s > CLOCK_SPAN_S:
             wrong_by_s = RESUME_TOLERANCE_S + first.waited_s + last.waited_s
-            self._lost_clock = _LostClock(last, self._clock_speed(), RESUME_TOLERANCE_RATIO + wrong_by_s / min_span_s)
+            return _LostClock(last, self._clock_speed(clock), RESUME_TOLERANCE_RATIO + wrong_by_s / min_span_s)
+        if min_span_s < REAL_TIME_SPAN_S:
+            return None
+        # Only real time is recognised so soon.
+        real_time_error_ms = abs(last.milliseconds - first.milliseconds - 1000 * (last.read_at - first.read_at))
+        is_real_time = real_time_error_ms <= 1000 * REAL_TIME_TOLERANCE_RATIO * min_span_s
+        return _LostClock(last, 1000.0, RESUME_TOLERANCE_RATIO) if is_real_time else None
+
+    def _on_unproved_frame(self, frame: Frame) -> None:
+        """Compare the clock in a frame that arrived after the link was lost with the clock from before."""
+        if not self._lost_clocks:  # Nothing can show whether it is the same boot of the same vehicle.
+            self._on_reboot_detected({})
+            return
+        if self._unproved_since is None:
+            self._unproved_since = self._now()
+        handler = self._clock_handlers.get(frame.message_id)
+        if handler is not None:
+            handler(frame)
+
+    def _end_proof(self) -> None:
+        self._lost_clocks, self._unproved_since = {}, None
+        if self._deliver_again is not None:
+            self._deliver_again()
+            self._deliver_again = None
 
     def _on_boot_time(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
             # ``time_boot_ms`` is at the start of the payload, which begins at byte 9 of ``body``.
-            self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
+            self._record_time(frame, BOOT_CLOCK, int.from_bytes(frame.body[9:13], "little"))
 
     def _on_system_time(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
             # ``time_boot_ms`` follows the 8 bytes of ``time_unix_usec`` in the payload.
-            self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
+            self._record_time(frame, BOOT_CLOCK, int.from_bytes(frame.body[17:21], "little"))
 
-    def _on_timesync(self, message: Timesync) -> None:
-        frame = message.received_frame
+    def _on_timesync(self, frame: Frame) -> None:
+        # ``tc1`` in ns, which is 0 in a request, is at the start of the payload.
+        vehicle_ns = int.from_bytes(frame.body[9:17], "little", signed=True)
         # The answers to TIMESYNC requests show a reboot even if the program requests no messages.
-        if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
-            self._record_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
+        if vehicle_ns != 0 and frame.component_id == self._component_id:
+            self._record_time(frame, "TIMESYNC", vehicle_ns // 1_000_000)
 
     def _record_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
         """Record a time since boot, and detect a reboot by it.
@@ -251,38 +301,46 @@ class VehicleWatch:
         ``clock`` names the message or field with the time.
         """
         now = self._now()
+        previous = self._last_readings.get(clock)
+        if clock == BOOT_CLOCK and previous is not None and milliseconds < previous.milliseconds:
+            milliseconds = self._unwrapped(milliseconds, previous, now)
         reading = _ClockReading(milliseconds, now, now - frame.received_at)
-        previous = self._last_readings.get(clock, reading)
+        previous = previous or reading
         if self._is_expected_reboot(frame, previous, milliseconds):
-            self._on_reboot_detected(clock, milliseconds)
+            self._on_reboot_detected({clock: reading})
         elif previous.milliseconds - milliseconds <= REBOOT_MIN_DECREASE_MS:  # The decrease is too small for a reboot.
             self._last_readings[clock] = reading
-            if self._first_reading is None and clock == "time_boot_ms":
-                self._first_reading = reading
+            self._first_readings.setdefault(clock, reading)
             # If an earlier message reported a far smaller time, that message was late.
             self._decreased_readings.pop(clock, None)
         elif self._is_decrease_confirmed(clock, milliseconds):
-            self._on_reboot_detected(clock, milliseconds)
-        if clock == "time_boot_ms" and self._is_other_boot(reading):
-            self._on_reboot_detected(clock, milliseconds)
+            self._on_reboot_detected({clock: reading})
+        if clock in self._lost_clocks and self._is_other_boot(clock, reading):
+            self._on_reboot_detected({clock: reading})
 
-    def _is_other_boot(self, reading: _ClockReading) -> bool:
+    def _unwrapped(self, milliseconds: int, previous: _ClockReading, now: float) -> int:
+        """Return a reading of ``time_boot_ms``, which begins at 0 again after 49.7 days, as a time that only grows."""
+        expected = previous.milliseconds + self._clock_speed() * (now - previous.read_at)
+        wraps = round((expected - milliseconds) / BOOT_CLOCK_RANGE_MS)
+        unwrapped = milliseconds + wraps * BOOT_CLOCK_RANGE_MS
+        return unwrapped if abs(unwrapped - expected) <= REBOOT_MIN_DECREASE_MS else milliseconds
+
+    def _is_other_boot(self, clock: str, reading: _ClockReading) -> bool:
         """Return True if the clock does not continue that from before the last loss of the link."""
-        if self._lost_clock is None:
-            return False
-        last, speed, tolerance_ratio = self._lost_clock
+        last, speed, tolerance_ratio = self._lost_clocks[clock]
         # While the computer sleeps, our clock stands still.
         away_s = reading.read_at - last.read_at + self._connection._slept_since(last.read_at)
         difference_ms = abs(reading.milliseconds - last.milliseconds - speed * away_s)
         tolerance_s = RESUME_TOLERANCE_S + last.waited_s + reading.waited_s + tolerance_ratio * away_s
         if difference_ms <= speed * tolerance_s:
-            self._lost_clock = None
+            self._end_proof()
             return False
-        resumed = self._resumed_reading or reading
+        self._unproved_since = reading.read_at
+        resumed = self._resumed_readings.get(clock, reading)
         resumed_s = reading.read_at - resumed.read_at
         if reading.milliseconds - resumed.milliseconds > speed * (resumed_s + RESUME_CONFIRM_S / 2):
             resumed = reading  # The clock runs too fast, so delayed messages arrive in a burst.
-        self._resumed_reading = resumed
+        self._resumed_readings[clock] = resumed
         return reading.read_at - resumed.read_at >= RESUME_CONFIRM_S
 
     def _is_expected_reboot(self, frame: Frame, previous: _ClockReading, milliseconds: int) -> bool:
@@ -304,17 +362,19 @@ class VehicleWatch:
             return False
         return milliseconds > lowest.milliseconds and reading.read_at - lowest.read_at >= REBOOT_CONFIRM_S
 
-    def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
+    def _on_reboot_detected(self, readings: dict[str, _ClockReading]) -> None:
+        """Report a reboot, which these readings have shown."""
         now = self._connection.now()
         # Discard older readings. A comparison with them would show the same reboot again.
-        self._last_readings = {clock: _ClockReading(milliseconds, now)}
+        self._last_readings, self._first_readings = readings, {}
         self._decreased_readings = {}
-        self._first_reading = self._lost_clock = None
         self._last_answer = _ClockReading(0, now)
         self._reboot_ordered_at = None
         self.reboots += 1
+        self.other_boots += self._deliver_again is not None
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
+        self._end_proof()  # The subscribers above can still see that the link was lost.
 
 
 class _Counts(NamedTuple):
@@ -347,6 +407,7 @@ class LinkWatch:
         # Called with each TIMESYNC answer: our time of the request (s), and the vehicle's time (ms).
         self._on_answer = on_answer
         self._round_trip_s: float | None = None
+        self._measured_at = -math.inf  # time of the last measurement of the round trip
         # The times (ns) in the unanswered TIMESYNC requests. Each answer repeats the time of its request.
         self._open_requests: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
         self._next_request_at = connection.now()
@@ -359,7 +420,8 @@ class LinkWatch:
 
     @property
     def round_trip_s(self) -> float | None:
-        return self._round_trip_s
+        is_recent = self._connection.now() - self._measured_at <= ROUND_TRIP_MAX_AGE_S
+        return self._round_trip_s if is_recent else None
 
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Publish a report and call ``on_tick`` once a second, until the connection ends."""
@@ -394,7 +456,7 @@ class LinkWatch:
             now = self._connection.now()
             # An answer that was processed long after its arrival would measure this program's delay, not the link's.
             if now - frame.received_at < CHECK_INTERVAL_S:
-                self._round_trip_s = now - message.ts1 / 1e9
+                self._round_trip_s, self._measured_at = now - message.ts1 / 1e9, now
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:
@@ -407,7 +469,7 @@ class LinkWatch:
             counts.at,
             self._system_id,
             loss_percent=100 * missing / (frames + missing) if frames + missing else None,
-            round_trip_s=self._round_trip_s,
+            round_trip_s=self.round_trip_s,
             frames_per_s=frames / seconds,
             bytes_per_s=(counts.total_bytes - before.total_bytes) / seconds,
         )
