@@ -137,7 +137,6 @@ async def cabled(copter: SimulatedCopter | None = None, **options: Any) -> Async
 async def test_interruption_events() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()
-        await anyio.sleep(2)
         with vehicle.subscribe(*NEWS, capacity=9) as news:
             await cable.is_away(6)
             received = [await news.get(10) for _ in range(4)]
@@ -227,7 +226,6 @@ async def test_pilot_who_arms_after_unsent_arming_keeps_vehicle() -> None:
 async def test_order_is_sent_when_link_is_restored() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()
-        await anyio.sleep(2)
         async with anyio.create_task_group() as tasks:
             cable.pull()
             tasks.start_soon(vehicle.set_mode, "GUIDED")

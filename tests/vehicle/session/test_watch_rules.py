@@ -294,13 +294,23 @@ def test_backlog_after_lost_link_is_no_reboot() -> None:
     assert [stage.clock(83_100 + 100 * number) for number in range(20)] == [0] * 20
 
 
-@pytest.mark.parametrize("observed_s", [0.9, 1.1])
-def test_lost_link_soon_after_connect_real_time_is_recognised(observed_s: float) -> None:
+@pytest.mark.parametrize(("speed", "reboots"), [(1, 0), (1.2, 0), (2, 1), (20, 1)])
+def test_lost_link_soon_after_connect_real_time_is_recognised(speed: float, reboots: int) -> None:
     stage = Watched()
     stage.clock(100_000)
-    stage.clock(100_000 + round(1000 * observed_s), after=observed_s)
+    stage.clock(100_000 + round(800 * speed), after=0.8)
     stage.lose_link()
-    assert stage.clock(110_000 + round(1000 * observed_s), after=10.0) == (observed_s < 1.0)
+    assert stage.clock(110_800, after=10.0) == reboots
+
+
+def test_clock_read_once_before_lost_link_must_continue() -> None:
+    for continues in (True, False):
+        stage = Watched()
+        stage.clock(100_000)
+        stage.lose_link()
+        resumed_ms = 110_000 if continues else 150_000
+        stage.clock(resumed_ms, after=10.0)
+        assert stage.clock(resumed_ms + 1100, after=1.1) == (not continues)
 
 
 def test_lost_link_without_clock_afterwards_is_reboot() -> None:

@@ -52,8 +52,8 @@ RESUME_TIMEOUT_S = 5.0
 CLOCK_SPAN_S = 5.0
 # A greater time, in TIMESYNC answers of other firmware, is the time of day, which is the same on all vehicles.
 MAX_RUNNING_TIME_MS = 100_000_000_000
-# A clock that keeps real time to within this fraction for at least this many seconds is not that of a fast simulation.
-REAL_TIME_SPAN_S, REAL_TIME_TOLERANCE_RATIO = 1.0, 0.1
+# A clock that differs from real time by more than this, within CLOCK_SPAN_S, is that of a faster simulation.
+REAL_TIME_TOLERANCE_S = 0.3
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
 # A round trip is unknown again after this many seconds without an answer to TIMESYNC. The link may have changed.
@@ -241,25 +241,26 @@ class VehicleWatch:
         self._resumed_readings, self._unproved_since = {}, None
         if self._deliver_again is not None:  # The link was lost again before the clocks were compared.
             return
-        lost_clocks = {clock: self._lost_clock(clock) for clock in self._first_readings}
-        self._lost_clocks = {clock: lost for clock, lost in lost_clocks.items() if lost is not None}
+        self._lost_clocks = self._comparable_clocks()
         self._deliver_again = self._connection.hold_back(self._system_id, self._on_unproved_frame)
 
-    def _lost_clock(self, clock: str) -> _LostClock | None:
-        """Return what is known about a clock when the link is lost; None if its speed is unknown."""
-        first, last = self._first_readings[clock], self._last_readings[clock]
-        if last.milliseconds > MAX_RUNNING_TIME_MS:
-            return None
-        min_span_s = last.read_at - first.read_at - last.waited_s
-        if min_span_s > CLOCK_SPAN_S:
-            wrong_by_s = RESUME_TOLERANCE_S + first.waited_s + last.waited_s
-            return _LostClock(last, self._clock_speed(clock), RESUME_TOLERANCE_RATIO + wrong_by_s / min_span_s)
-        if min_span_s < REAL_TIME_SPAN_S:
-            return None
-        # Only real time is recognised so soon.
-        real_time_error_ms = abs(last.milliseconds - first.milliseconds - 1000 * (last.read_at - first.read_at))
-        is_real_time = real_time_error_ms <= 1000 * REAL_TIME_TOLERANCE_RATIO * min_span_s
-        return _LostClock(last, 1000.0, RESUME_TOLERANCE_RATIO) if is_real_time else None
+    def _comparable_clocks(self) -> dict[str, _LostClock]:
+        """Return the clocks that must continue after the loss of the link; none if their speed is unknown."""
+        lost_clocks: dict[str, _LostClock] = {}
+        for clock, first in self._first_readings.items():
+            last = self._last_readings[clock]
+            if last.milliseconds > MAX_RUNNING_TIME_MS:
+                continue
+            span_s = last.read_at - first.read_at
+            waited_s = first.waited_s + last.waited_s
+            speed, tolerance_ratio = 1000.0, RESUME_TOLERANCE_RATIO
+            if span_s - last.waited_s > CLOCK_SPAN_S:
+                speed = self._clock_speed(clock)
+                tolerance_ratio += (RESUME_TOLERANCE_S + waited_s) / (span_s - last.waited_s)
+            elif abs((last.milliseconds - first.milliseconds) / 1000 - span_s) > REAL_TIME_TOLERANCE_S + waited_s:
+                return {}
+            lost_clocks[clock] = _LostClock(last, speed, tolerance_ratio)
+        return lost_clocks
 
     def _on_unproved_frame(self, frame: Frame) -> None:
         """Compare the clock in a frame that arrived after the link was lost with the clock from before."""
