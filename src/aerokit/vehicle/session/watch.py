@@ -45,15 +45,18 @@ EXPECTED_REBOOT_MIN_LAG_MS = 2000
 # RESUME_CONFIRM_S, because the first messages may be late.
 RESUME_TOLERANCE_S, RESUME_TOLERANCE_RATIO = 1.5, 0.05
 RESUME_CONFIRM_S = 1.0
-# If the vehicle sends no time since boot for this many seconds after its first message, it counts as rebooted.
-RESUME_TIMEOUT_S = 5.0
+# If the vehicle sends no time since boot for this many seconds after its first message, it counts as rebooted. The same
+# if delayed messages seem to arrive for MAX_PROOF_S.
+RESUME_TIMEOUT_S, MAX_PROOF_S = 5.0, 30.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
 # many seconds apart.
 CLOCK_SPAN_S = 5.0
 # A greater time, in TIMESYNC answers of other firmware, is the time of day, which is the same on all vehicles.
 MAX_RUNNING_TIME_MS = 100_000_000_000
-# A clock that differs from real time by more than this, within CLOCK_SPAN_S, is that of a faster simulation.
-REAL_TIME_TOLERANCE_S = 0.3
+# If the clock was observed for less than this before the loss of the link, its speed is not known.
+MIN_CLOCK_SPAN_S = 1.0
+# A clock that differs from real time by more than these seconds plus this fraction is that of a faster simulation.
+REAL_TIME_TOLERANCE_S, REAL_TIME_TOLERANCE_RATIO = 0.05, 0.1
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
 # A round trip is unknown again after this many seconds without an answer to TIMESYNC. The link may have changed.
@@ -86,6 +89,13 @@ class _LostClock(NamedTuple):
     last: _ClockReading
     speed: float  # ms/s
     tolerance_ratio: float  # by which ``speed`` may be wrong
+    is_speed_known: bool  # False if real time is only assumed
+
+
+def _is_real_time(first: _ClockReading, last: _ClockReading) -> bool:
+    span_s = last.read_at - first.read_at
+    tolerance_s = REAL_TIME_TOLERANCE_S + REAL_TIME_TOLERANCE_RATIO * span_s + first.waited_s + last.waited_s
+    return abs((last.milliseconds - first.milliseconds) / 1000 - span_s) <= tolerance_s
 
 
 class VehicleWatch:
@@ -134,8 +144,9 @@ class VehicleWatch:
         self._lost_clocks: dict[str, _LostClock] = {}
         # The first reading of each clock since then that does not continue the clock.
         self._resumed_readings: dict[str, _ClockReading] = {}
-        # Time of the last of these readings, or of the first frame since then; None before it.
+        # Times of the first frame since then, and of the last of these readings or, without one, of that frame.
         self._unproved_since: float | None = None
+        self._clock_read_at = -math.inf
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
         # The vehicle's time in the last answer to a TIMESYNC request.
@@ -217,8 +228,10 @@ class VehicleWatch:
         now = self._connection.now()
         silent_for = self.silent_for_s
         self._state_tracker.check(now)
-        if self._unproved_since is not None and now - self._unproved_since > RESUME_TIMEOUT_S:
-            self._on_reboot_detected({})
+        if self._unproved_since is not None:
+            has_clock_stopped = now - self._clock_read_at > RESUME_TIMEOUT_S
+            if has_clock_stopped or now - self._unproved_since > MAX_PROOF_S:
+                self._on_reboot_detected({})
         if silent_for > SILENT_AFTER_S and not self._is_reported_silent:
             self._is_reported_silent = True
             self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
@@ -252,14 +265,13 @@ class VehicleWatch:
             if last.milliseconds > MAX_RUNNING_TIME_MS:
                 continue
             span_s = last.read_at - first.read_at
-            waited_s = first.waited_s + last.waited_s
             speed, tolerance_ratio = 1000.0, RESUME_TOLERANCE_RATIO
             if span_s - last.waited_s > CLOCK_SPAN_S:
                 speed = self._clock_speed(clock)
-                tolerance_ratio += (RESUME_TOLERANCE_S + waited_s) / (span_s - last.waited_s)
-            elif abs((last.milliseconds - first.milliseconds) / 1000 - span_s) > REAL_TIME_TOLERANCE_S + waited_s:
+                tolerance_ratio += (RESUME_TOLERANCE_S + first.waited_s + last.waited_s) / (span_s - last.waited_s)
+            elif not _is_real_time(first, last):
                 return {}
-            lost_clocks[clock] = _LostClock(last, speed, tolerance_ratio)
+            lost_clocks[clock] = _LostClock(last, speed, tolerance_ratio, is_speed_known=span_s >= MIN_CLOCK_SPAN_S)
         return lost_clocks
 
     def _on_unproved_frame(self, frame: Frame) -> None:
@@ -268,7 +280,7 @@ class VehicleWatch:
             self._on_reboot_detected({})
             return
         if self._unproved_since is None:
-            self._unproved_since = self._now()
+            self._unproved_since = self._clock_read_at = self._now()
         handler = self._clock_handlers.get(frame.message_id)
         if handler is not None:
             handler(frame)
@@ -328,7 +340,7 @@ class VehicleWatch:
 
     def _is_other_boot(self, clock: str, reading: _ClockReading) -> bool:
         """Return True if the clock does not continue that from before the last loss of the link."""
-        last, speed, tolerance_ratio = self._lost_clocks[clock]
+        last, speed, tolerance_ratio, is_speed_known = self._lost_clocks[clock]
         # While the computer sleeps, our clock stands still.
         away_s = reading.read_at - last.read_at + self._connection._slept_since(last.read_at)
         difference_ms = abs(reading.milliseconds - last.milliseconds - speed * away_s)
@@ -336,7 +348,9 @@ class VehicleWatch:
         if difference_ms <= speed * tolerance_s:
             self._end_proof()
             return False
-        self._unproved_since = reading.read_at
+        if not is_speed_known:
+            return True
+        self._clock_read_at = reading.read_at
         resumed = self._resumed_readings.get(clock, reading)
         resumed_s = reading.read_at - resumed.read_at
         if reading.milliseconds - resumed.milliseconds > speed * (resumed_s + RESUME_CONFIRM_S / 2):
