@@ -118,6 +118,17 @@ def test_first_order_at_a_new_port_is_no_copy() -> None:
         assert stage.pass_on(name, FIRST_ORDER) == {"a"}
 
 
+def test_copy_that_creates_its_port_is_dropped() -> None:
+    """A station sends over two links; the port of the second link is made by the copy of an order."""
+    stage = Stage()
+    stage.receive("a", COPTER)
+    assert stage.pass_on("c", FIRST_ORDER) == {"a"}
+    stage.now += 0.05
+    stage.nodes["e"] = stage.router.add("e")
+    assert stage.pass_on("e", FIRST_ORDER) == set()
+    assert stage.reason == "duplicate"
+
+
 def test_first_order_after_port_removal_is_no_copy() -> None:
     stage = Stage()
     stage.receive("a", COPTER)

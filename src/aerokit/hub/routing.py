@@ -15,6 +15,7 @@ from aerokit.hub.senders import (
     LOOP_WINDOW_S,
     MAX_RECENT_FRAMES,
     MIN_LOOP_FRAMES,
+    NEW_PORT_WINDOW_S,
     REPEAT_WINDOW_S,
     RecentFrames,
     Sender,
@@ -115,7 +116,8 @@ class Router(Generic[PortT]):
     - Ground stations that share ids all get the messages for these ids. An autopilot has priority over other senders
       with its ids.
     - A frame never goes back to the port at which it arrived. A copy that arrives at another port within two seconds is
-      dropped. Later copies are forwarded until several of them show that the ports form a loop.
+      dropped (at a new port: within 0.1 s). Later copies are forwarded until several of them show that the ports form a
+      loop.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
     At most `MAX_ROUTES` senders are remembered. A new sender replaces a sender without heartbeats, or a sender that was
@@ -301,7 +303,9 @@ class Router(Generic[PortT]):
         else:
             # A port that was added after the earlier frame arrived cannot have returned it.
             may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S
-            is_copy = may_be_echo and first_port in self._ingresses and age_s <= DUPLICATE_WINDOW_S
+            # A copy over the sender's second link may be what creates that link's port.
+            max_age_s = DUPLICATE_WINDOW_S if may_be_echo else NEW_PORT_WINDOW_S
+            is_copy = first_port in self._ingresses and age_s <= max_age_s
         if is_copy:
             return self._duplicate
         # A late frame may have returned through a slow loop, or may equal the earlier frame by chance, like the first

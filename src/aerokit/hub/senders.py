@@ -24,6 +24,9 @@ DUPLICATE_WINDOW_S = 2.0
 REPEAT_WINDOW_S = 0.5
 """Seconds in which an equal frame from the same port counts as a duplicate, if its number is out of order."""
 
+NEW_PORT_WINDOW_S = 0.1
+"""Like `DUPLICATE_WINDOW_S`, for a port that is newer than the earlier frame. A restarted program needs longer."""
+
 LOOP_WINDOW_S = 60.0
 """A frame that returns through another port is recognised up to this time after it was first received.
 
