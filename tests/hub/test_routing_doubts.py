@@ -118,6 +118,38 @@ def test_first_order_at_a_new_port_is_no_copy() -> None:
         assert stage.pass_on(name, FIRST_ORDER) == {"a"}
 
 
+@pytest.mark.parametrize("component", [0, 1])
+def test_order_before_the_first_heartbeat_takes_one_path(component: int) -> None:
+    """A hub starts beside a vehicle with two radios, whose first frames are no HEARTBEATs."""
+    stage = Stage()
+    for port in "abb":  # the first one at port b is a copy
+        stage.receive(port, Attitude(0, 0, 0, 0, 0, 0, 0))
+        stage.receive(port, Attitude(0, 0, 0, 0, 0, 0, 0), 1, 100)
+    assert stage.receive("c", order(1, component), 255, 190) == {"a"}
+    stage.receive("a", COPTER)
+    assert stage.receive("c", order(1, component), 255, 190) == {"a"}
+
+
+def test_stations_without_heartbeats_that_share_ids_all_receive() -> None:
+    stage = Stage()
+    for _ in range(5):
+        stage.now += 1.0
+        for port, message in (("b", ParamRequestList(1, 1)), ("c", order(1))):
+            stage.receive(port, message, 255, 0)
+    assert stage.receive("a", order(255, 0)) == {"b", "c"}
+
+
+def test_copy_that_creates_its_port_is_dropped() -> None:
+    """A station sends over two links; the port of the second link is made by the copy of an order."""
+    stage = Stage()
+    stage.receive("a", COPTER)
+    assert stage.pass_on("c", FIRST_ORDER) == {"a"}
+    stage.now += 0.05
+    stage.nodes["e"] = stage.router.add("e")
+    assert stage.pass_on("e", FIRST_ORDER) == set()
+    assert stage.reason == "duplicate"
+
+
 def test_first_order_after_port_removal_is_no_copy() -> None:
     stage = Stage()
     stage.receive("a", COPTER)

@@ -23,7 +23,7 @@ from aerokit.mavlink.messages import Attitude, CommandLong, ParamRequestList, Pa
 from aerokit.missions import Mission, waypoint
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.testing import FaultModel, FaultyLink, run_virtual
-from aerokit.transport import Link, memory_link_pair
+from aerokit.transport import Link, Peer, memory_link_pair
 
 KEY = SigningKey.from_passphrase("border")
 DATA = random.Random(7).randbytes(6_000)
@@ -220,6 +220,21 @@ def test_vehicle_with_our_system_id_gets_station_frames() -> None:
         assert on.vehicle.received == ["HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_LIST"]
 
     on_stage(play, ids=(1, 191))
+
+
+def test_frames_that_the_shared_link_drops_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def play(on: Stage) -> None:
+        link = on.connection.link
+
+        def drop(data: bytes, peer: Peer = None) -> None:
+            link.dropped_writes += 1
+
+        monkeypatch.setattr(link, "write", drop)
+        on.station.send(ORDER)
+        await settle()
+        assert {endpoint.name: endpoint.dropped for endpoint in on.hub.endpoints}["program"] == {"link": 1}
+
+    on_stage(play)
 
 
 def test_answers_go_to_their_target() -> None:

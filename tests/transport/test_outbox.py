@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
 import sys
@@ -415,6 +416,37 @@ async def test_tcp_link_is_lost_if_closed_server_reads_nothing(
         connection.shutdown(socket.SHUT_WR)
         await recorder.until_lost()
         await client.wait_closed()
+
+
+@on_linux
+@each_loop
+async def test_connection_that_fails_while_it_resumes_is_lost_once(
+    deaf: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """asyncio ends a connection twice, with an AttributeError, if a write fails inside ``resume_writing``."""
+    errors: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: errors.append(context))
+    client, recorder = TcpConnect(*deaf.getsockname()), Recorder()
+    await client.open(recorder)
+    connection, _ = deaf.accept()
+    connection.setblocking(False)
+    resume = Outbox.resume
+
+    def resume_after_reset(waiting: Outbox) -> None:
+        connection.close()  # with unread data, so that the system resets the connection
+        resume(waiting)
+
+    monkeypatch.setattr(Outbox, "resume", resume_after_reset)
+    await fill(client, bytes(280))
+    client.write(bytes(280))
+    while connection.fileno() >= 0:
+        with contextlib.suppress(BlockingIOError):
+            connection.recv(2048)
+        await asyncio.sleep(0)
+    await recorder.until_lost()
+    await client.wait_closed()
+    await asyncio.sleep(0)  # asyncio would end the connection again in this iteration
+    assert errors == []
 
 
 @on_linux

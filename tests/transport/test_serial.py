@@ -4,6 +4,7 @@ import asyncio
 import errno
 import importlib
 import importlib.util
+import math
 import os
 import subprocess
 import sys
@@ -236,6 +237,41 @@ async def test_bytes_cleared_from_driver_count_as_dropped_write(monkeypatch: pyt
         link.discard_unsent()
         assert link.dropped_writes == taken
         monkeypatch.undo()
+        link.close()
+        await link.wait_closed()
+
+
+@each_loop
+@pytest.mark.parametrize(("room", "arriving"), [(0, b"after"), (3, b"an orderafter")])
+async def test_write_that_waited_for_the_driver_too_long_is_dropped(
+    monkeypatch: pytest.MonkeyPatch, room: int, arriving: bytes
+) -> None:
+    """A write that was sent in part is completed, because the receiver would take the next frame for its rest."""
+    attempts = []
+    write = os.write
+
+    def write_to_busy_driver(fd: int, data: bytes) -> int:
+        if bytes(data) == b"an order":
+            attempts.append(data)
+            assert link._outbox is not None
+            link._outbox._last_forwarded = 1, -math.inf  # The time-out ends before the driver has room again.
+            if len(attempts) == 1:
+                if not room:
+                    raise BlockingIOError
+                return write(fd, data[:room])
+        return write(fd, data)
+
+    monkeypatch.setattr(os, "write", write_to_busy_driver)
+    with far_end() as far:
+        link = SerialLink(far.device, 57600)
+        await link.open(Recorder())
+        far.reads()
+        link.write(b"an order")
+        await eventually(lambda: bool(attempts) and not link._transport.get_write_buffer_size())
+        link.write(b"after")
+        await far.recorder.until_data(arriving)
+        assert link.dropped_writes == (0 if room else 1)
+        assert len(attempts) == 1
         link.close()
         await link.wait_closed()
 

@@ -15,6 +15,7 @@ from aerokit.hub.senders import (
     LOOP_WINDOW_S,
     MAX_RECENT_FRAMES,
     MIN_LOOP_FRAMES,
+    NEW_PORT_WINDOW_S,
     REPEAT_WINDOW_S,
     RecentFrames,
     Sender,
@@ -113,9 +114,10 @@ class Router(Generic[PortT]):
     - A message for a whole system goes to the port of its autopilot, and to each port at which only other components of
       the system were received.
     - Ground stations that share ids all get the messages for these ids. An autopilot has priority over other senders
-      with its ids.
+      with its ids. Before its first HEARTBEAT, a sender counts as a vehicle for 3.5 s.
     - A frame never goes back to the port at which it arrived. A copy that arrives at another port within two seconds is
-      dropped. Later copies are forwarded until several of them show that the ports form a loop.
+      dropped (at a new port: within 0.1 s). Later copies are forwarded until several of them show that the ports form a
+      loop.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
     At most `MAX_ROUTES` senders are remembered. A new sender replaces a sender without heartbeats, or a sender that was
@@ -301,7 +303,9 @@ class Router(Generic[PortT]):
         else:
             # A port that was added after the earlier frame arrived cannot have returned it.
             may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S
-            is_copy = may_be_echo and first_port in self._ingresses and age_s <= DUPLICATE_WINDOW_S
+            # A copy over the sender's second link may be what creates that link's port.
+            max_age_s = DUPLICATE_WINDOW_S if may_be_echo else NEW_PORT_WINDOW_S
+            is_copy = first_port in self._ingresses and age_s <= max_age_s
         if is_copy:
             return self._duplicate
         # A late frame may have returned through a slow loop, or may equal the earlier frame by chance, like the first
@@ -358,6 +362,9 @@ class Router(Generic[PortT]):
         plan = self._make_plan(ingress, key)
         if plan.reason:  # This plan is not cached, because a sender could fill the cache with unknown targets.
             return plan
+        system_id, _ = plan.target
+        if system_id and any(sender.may_become_vehicle for sender in self._senders_of(system_id)):
+            return plan  # It changes without a call of `forget_plans` when the sender is no longer new.
         ingress.plans[key] = plan
         # The fast path of `route_all` is only for messages without a target. Heartbeats, and frames at another port
         # than the sender's, may change the data about the sender, so `route` must process them.
@@ -413,13 +420,13 @@ class Router(Generic[PortT]):
         if target is not None:
             return [ingress_number] if target is sender else list(target.destinations)
         # A message for an unknown component goes to its whole system, to its autopilots first.
-        components = [component for component in self._senders.values() if component.system_id == system_id]
+        components = self._senders_of(system_id)
         components.sort(key=lambda component: not component.is_autopilot)
         autopilots = [component for component in components if component.is_autopilot]
         numbers: list[int] = []
         for component in components:
             # A vehicle needs no further port if one of the chosen ports reaches it.
-            is_reached = component.is_vehicle and any(component.is_at(number) for number in numbers)
+            is_reached = component.has_one_destination and any(component.is_at(number) for number in numbers)
             if is_reached:
                 continue
             destinations = (ingress_number,) if component is sender else component.destinations
@@ -430,6 +437,9 @@ class Router(Generic[PortT]):
                 if number not in numbers and (component.is_autopilot or not reaches_autopilot):
                     numbers.append(number)
         return numbers
+
+    def _senders_of(self, system_id: int) -> list[Sender]:
+        return [sender for sender in self._senders.values() if sender.system_id == system_id]
 
     def _is_redundant(self, number: int, sender: Sender) -> bool:
         """Return True if all autopilots at a port get a broadcast command through other ports, or if one sent it."""

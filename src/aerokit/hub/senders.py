@@ -24,6 +24,9 @@ DUPLICATE_WINDOW_S = 2.0
 REPEAT_WINDOW_S = 0.5
 """Seconds in which an equal frame from the same port counts as a duplicate, if its number is out of order."""
 
+NEW_PORT_WINDOW_S = 0.1
+"""Like `DUPLICATE_WINDOW_S`, for a port that is newer than the earlier frame. A restarted program needs longer."""
+
 LOOP_WINDOW_S = 60.0
 """A frame that returns through another port is recognised up to this time after it was first received.
 
@@ -52,6 +55,8 @@ class Sender:
     __slots__ = (
         "autopilot_ports",
         "component_id",
+        "first_received_at",
+        "has_heartbeat",
         "is_autopilot",
         "is_vehicle",
         "port_number",
@@ -70,6 +75,8 @@ class Sender:
         """Number of the port to which messages for a vehicle go. Messages for a ground station go to all `ports`."""
         self.received_at: float = now
         """Time of the last frame at that port."""
+        self.first_received_at: float = now
+        self.has_heartbeat: bool = False
         self.ports: dict[int, float] = {port_number: now}
         """Maps port numbers to the time of the last frame there; for `port_number`, use :attr:`received_at`."""
         self.is_vehicle: bool = False
@@ -79,8 +86,18 @@ class Sender:
         """Ports at which the sender was received as an autopilot."""
 
     @property
+    def may_become_vehicle(self) -> bool:
+        """True before the first HEARTBEAT of a sender that is too new to be known as one without HEARTBEATs."""
+        return not self.has_heartbeat and self.received_at - self.first_received_at <= ROUTE_TIMEOUT_S
+
+    @property
+    def has_one_destination(self) -> bool:
+        """True for vehicles, which would execute a command twice if it was sent to all `ports`."""
+        return self.is_vehicle or self.may_become_vehicle
+
+    @property
     def destinations(self) -> Iterable[int]:
-        return (self.port_number,) if self.is_vehicle else self.ports
+        return (self.port_number,) if self.has_one_destination else self.ports
 
     def is_at(self, number: int) -> bool:
         """Return True if the sender's frames arrive at port ``number``, which may be `port_number` or another port."""
@@ -107,6 +124,7 @@ class Sender:
         if len(body) <= _AUTOPILOT:  # The payload is too short for a HEARTBEAT.
             return False
         before = self.is_vehicle, self.is_autopilot
+        self.has_heartbeat = True
         self.is_vehicle = body[_TYPE] != _GROUND_STATION
         self.is_autopilot = is_autopilot(body)
         return before != (self.is_vehicle, self.is_autopilot)

@@ -68,7 +68,9 @@ class SharedLink(Link):
                 if signed is None:
                     self.dropped_writes += 1
                 else:
+                    dropped_before = self.connection.link.dropped_writes
                     self.connection.write_raw(signed)
+                    self.dropped_writes += self.connection.link.dropped_writes - dropped_before
             except AerokitError:  # The connection has ended, or the frame cannot be signed.
                 self.dropped_writes += 1
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import sys
 from collections import deque
 from collections.abc import Callable
@@ -53,6 +54,7 @@ class Outbox:
         self._waiting: deque[_WaitingWrite] = deque()
         self._waiting_bytes = 0
         self._forwarded_bytes = 0  # number of bytes written to the transport
+        self._last_forwarded = (0, math.inf)  # number of writes forwarded last, and the deadline of the oldest of them
         self._sent_bytes = 0  # number of bytes that had left this machine at the last poll
         self._progress_at = 0.0  # time at which data last left this machine, or at which polling began
         self._is_full = False  # True between pause() and resume()
@@ -75,7 +77,7 @@ class Outbox:
         if self._is_full or self._is_stalled or self._waiting:
             self._buffer(bytes(data))
         else:
-            self._forward(data)
+            self._forward(data, 1, self._loop.time() + WRITE_TIMEOUT_S)
         if self._timer is None:
             self._progress_at = self._loop.time()
             self._schedule_poll()
@@ -103,6 +105,18 @@ class Outbox:
         """Record that this many bytes were discarded from the transport or the kernel."""
         self._forwarded_bytes -= count
 
+    def drop_forwarded_if_late(self, size: int) -> bool:
+        """Count the data forwarded last as dropped if it has waited too long. Return True if the data is dropped.
+
+        Call it before the transport sends the first of these ``size`` bytes.
+        """
+        count, deadline = self._last_forwarded
+        if self._loop.time() < deadline:
+            return False
+        self._on_dropped(count)
+        self.record_discarded(size)
+        return True
+
     def close(self) -> None:
         """Forward waiting data, or drop it if the transport is stalled. Afterwards, ``on_stalled`` is not called."""
         if self._is_closed:
@@ -113,7 +127,7 @@ class Outbox:
             self.discard()
         self._drop_outdated()
         while self._waiting:
-            self._forward(self._take_joined())
+            self._forward_joined()
 
     def _buffer(self, data: bytes) -> None:
         # An empty buffer accepts even a frame that is larger than the limit.
@@ -123,21 +137,24 @@ class Outbox:
         self._waiting.append(_WaitingWrite(self._loop.time() + WRITE_TIMEOUT_S, data))
         self._waiting_bytes += len(data)
 
-    def _forward(self, data: bytes) -> None:
+    def _forward(self, data: bytes, count: int, deadline: float) -> None:
         self._forwarded_bytes += len(data)
+        self._last_forwarded = count, deadline
         self._send(data)
 
     def _flush(self) -> None:
         self._drop_outdated()
         while self._waiting and not self._is_full and not self._is_stalled and not self._is_closed:
-            self._forward(self._take_joined())
+            self._forward_joined()
 
-    def _take_joined(self) -> bytes:
-        """Remove the next write and return it, joined with the writes that follow."""
+    def _forward_joined(self) -> None:
+        """Remove the next write and forward it, joined with the writes that follow."""
+        deadline, count = self._waiting[0].deadline, 1
         joined = self._pop_oldest()
         while self._waiting and len(joined) + len(self._waiting[0].data) <= _MAX_JOINED_BYTES:
             joined += self._pop_oldest()
-        return joined
+            count += 1
+        self._forward(joined, count, deadline)
 
     def _pop_oldest(self) -> bytes:
         data = self._waiting.popleft().data

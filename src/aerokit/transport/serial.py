@@ -62,6 +62,7 @@ class SerialLink(BaseLink):
         self._port: Any = None  # pyserial's port
         self._transport: Any = None  # pyserial-asyncio's transport; None while the link is not open
         self._outbox: Outbox | None = None  # None while the link is not open
+        self._is_partly_sent = False  # True while the transport keeps the rest of a write that the driver cut off
 
     @property
     def unsent_bytes(self) -> int:
@@ -80,6 +81,7 @@ class SerialLink(BaseLink):
         self._outbox.discard()
         bytes_before = self._unsent_bytes_of(self._transport)
         self._transport.flush()  # In pyserial-asyncio, flush() discards the transport's buffer.
+        self._is_partly_sent = False
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._unsent_bytes_of(self._transport)
@@ -94,6 +96,7 @@ class SerialLink(BaseLink):
         self._port, self._transport = self._open_port()
         self._released.clear()
         _replace_port_methods(self._port, self._device_failed)
+        self._port.write = partial(self._write_in_time, self._port.write)
         limit = max(4096, int(self._baud / 10 * _MAX_BUFFER_S))
         # The transport must buffer nothing itself: data that the driver does not accept waits in the outbox, where it
         # can be discarded.
@@ -129,6 +132,16 @@ class SerialLink(BaseLink):
         except _TermiosError as error:
             # pyserial does not convert a termios.error, which occurs if the device vanishes while it is being opened.
             raise serial.SerialException(*error.args) from error
+
+    def _write_in_time(self, write: Callable[[bytes], int], data: bytes) -> int:
+        """Replacement of the port's ``write`` that drops data for which the driver had no room in time."""
+        # The transport keeps one write until the driver has room. The rest of a frame that was sent in part is always
+        # sent, because the receiver would take the next frame for it.
+        if self._outbox is not None and not self._is_partly_sent and self._outbox.drop_forwarded_if_late(len(data)):
+            return len(data)
+        size = write(data)
+        self._is_partly_sent = size < len(data)
+        return size
 
     def _device_failed(self, error: OSError) -> None:
         # The loss is reported in a later loop iteration, because `write` must not call the receiver.

@@ -363,8 +363,10 @@ class _Stream(asyncio.Protocol):
             self._outbox.pause()
 
     def resume_writing(self) -> None:
+        # The outbox resumes in a later loop iteration. If a write fails inside this callback, asyncio ends the
+        # connection twice, and the second time raises an AttributeError.
         if self._outbox is not None:
-            self._outbox.resume()
+            self._loop.call_soon(self._outbox.resume)
 
     def _pending_bytes(self) -> int:
         if self._transport is None or self._fd < 0:

@@ -192,6 +192,17 @@ async def test_non_http_request_is_refused(noise: bytes, monkeypatch: pytest.Mon
         assert await server.order(await server.connect()) in GIVEN
 
 
+@pytest.mark.parametrize("method", ["POST", "HEAD"])
+async def test_invalid_body_of_running_request_logs_no_error(method: str, caplog: pytest.LogCaptureFixture) -> None:
+    """uvicorn would answer twice: once for the invalid body, once for the request."""
+    request = f"{method} /api/vehicles HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\n"
+    async with open_server() as server:
+        answer = await end_of(await server.connect(first=request.encode() + b"no chunk\r\n"))
+        assert answer.count(b"HTTP/1.1 ") <= 1
+        assert await server.order(await server.connect()) in GIVEN
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
 # --------------------------------------------------------------------------------- the stream
 
 

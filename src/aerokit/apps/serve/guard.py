@@ -8,6 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+import h11
 from starlette.datastructures import Headers, MutableHeaders
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -226,6 +227,16 @@ class _HttpConnection(H11Protocol):
     def handle_websocket_upgrade(self, event: Any) -> None:
         self._remove_from_anonymous()  # WebSockets are not counted here: the application limits their number.
         super().handle_websocket_upgrade(event)
+
+    def send_400_response(self, msg: str) -> None:
+        # A response that the application sends later would be the second one, and uvicorn would log an exception.
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        try:
+            super().send_400_response(msg)
+        except h11.LocalProtocolError:  # A response was begun before, or the request is a HEAD.
+            self._abort(self)
 
     def _start_timer(self) -> None:
         self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._abort, self)
