@@ -22,12 +22,14 @@ from aerokit.errors import (
     VerificationFailed,
 )
 from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import MavFtpOpcode
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
 from aerokit.protocols.exchange import TransferProgress
+from aerokit.protocols.ftp import FtpMessage
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
@@ -205,6 +207,24 @@ async def test_px4_plan_changed_by_another_station() -> None:
         flight.px4.missions.replace(0, long_mission(6).to_items())
         await anyio.sleep(1.5)
         await flight.vehicle.mission.upload(long_mission(5))
+        assert holds(flight, long_mission(5))
+
+
+async def test_interrupted_upload_by_file_keeps_mission() -> None:
+    """The last block of 24 items has four bytes: without it, the altitude of the last item is above sea level."""
+    async with open_flight(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(5))
+        handle = flight.copter.handlers[m.FileTransferProtocol.ID]
+
+        def lose_last_block(message: Any, *more: Any) -> None:
+            request = FtpMessage.decode(bytes(message.payload))
+            if (request.opcode, request.offset) != (MavFtpOpcode.WRITEFILE, 956):
+                handle(message, *more)
+
+        flight.copter.handlers[m.FileTransferProtocol.ID] = lose_last_block
+        with anyio.move_on_after(2):
+            await flight.vehicle.mission.upload(long_mission(24), method="ftp")
+        await anyio.sleep(1)
         assert holds(flight, long_mission(5))
 
 
