@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 import anyio
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 ResultT = TypeVar("ResultT")
 # Seconds after a refusal in which the texts that explain it may arrive.
 REFUSAL_TEXT_DELAY_S = 0.3
+UNKNOWN_CONTENT = "whether the vehicle has the new items is unknown: call download()"
 
 
 class PlanChannel:
@@ -52,6 +54,7 @@ class PlanChannel:
         # Path of the plan's file on ArduPilot.
         self._path = PACKED_PATHS[mission_type]
         self._has_changed = False  # True if the vehicle may have received some of our items
+        self._may_have_read_file = False  # True if the vehicle may have evaluated a file of this call
         self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
@@ -97,7 +100,12 @@ class PlanChannel:
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
         """Write the plan's file. ArduPilot evaluates the file when it is closed, and does not report the result."""
-        await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
+        self._may_have_read_file = True
+        try:
+            await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
+        except FileError:
+            self._may_have_read_file = False  # The vehicle has no such file, or has refused a part of it.
+            raise
         self._has_changed = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
@@ -189,9 +197,15 @@ class PlanChannel:
         is_partly_overwritten = overwrites_in_place and self._has_changed
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
+        if is_silent and self._may_have_read_file:
+            return f"; {UNKNOWN_CONTENT}"
         if is_partly_overwritten and refused_item:
+            # After the upload of a file there are no later items, because ArduPilot has cleared its plan first.
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
-            return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
+            later_items = "later items, if there are any, are old"
+            return f"; on the vehicle, {new_items} now, and {later_items}: upload again, or clear"
+        if is_partly_overwritten and refused_item == 0:
+            return "; on the vehicle, no item is new, and old items may be missing: upload again, or clear"
         if is_partly_overwritten:
             has = "may have" if is_silent else "has"
             return f"; the vehicle now {has} some new and some old items: upload again, or clear"
@@ -255,12 +269,15 @@ class PlanTransfer(Generic[PlanT]):
             return  # The vehicle has the plan now.
         self._cache.forget(self._context.now())
         if await self._uses_file(method, is_upload=True):
-            await self._send_file(items, method)
+            with self._describe_file_timeout(method, f"; {UNKNOWN_CONTENT}", missing=range(len(items) - self._offset)):
+                await self._send_file(items, method)
         else:
             await self._send_items(items, method, verify=verify)
 
     async def download(self, method: str) -> PlanT:
-        return self._plan_type.from_items(await self._read(method), home_is_item_0=bool(self._offset))
+        with self._describe_file_timeout(method):
+            items = await self._read(method)
+        return self._plan_type.from_items(items, home_is_item_0=bool(self._offset))
 
     async def clear(self) -> None:
         self._cache.forget(self._context.now())
@@ -312,6 +329,20 @@ class PlanTransfer(Generic[PlanT]):
             raise error
         self._cache.has_file = False
 
+    @contextmanager
+    def _describe_file_timeout(
+        self, method: str, consequence: str = "", *, missing: Sequence[int] = ()
+    ) -> Iterator[None]:
+        """Add the consequence to the text of a FileTimeout. Unless ``method`` is ``"ftp"``, raise a MissionTimeout."""
+        try:
+            yield
+        except FileTimeout as error:
+            text = f"{error}{consequence}"
+            if method != "ftp":
+                raise MissionTimeout(f"{self._name}: {text}", missing=tuple(missing)) from None
+            error.args = (text,)
+            raise
+
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
         result = await self._channel.send(items)
         if result.is_confirmed:
@@ -359,7 +390,8 @@ class PlanTransfer(Generic[PlanT]):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
-        await self._read(method)  # Another station may have changed the plan.
+        with self._describe_file_timeout(method, "; the vehicle still has its previous items"):
+            await self._read(method)  # Another station may have changed the plan.
         changed_seqs = self._changed_seqs(items)
         if changed_seqs == []:  # The vehicle has these items already.
             return True
