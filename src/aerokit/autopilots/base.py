@@ -242,6 +242,8 @@ class Autopilot:
     """MAV_MISSION_TYPEs whose old items are overwritten during an upload. For other types, old items stay until the
     upload is complete.
     """
+    erases_small_fences = False
+    """True if a new fence of one or two circles may be erased just after its upload."""
     mission_completes_at_home = False
     """True if a mission that ends with a return is reported as complete at home, False if when it starts to return."""
     holds_after_mission = False

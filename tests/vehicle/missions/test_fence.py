@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import anyio
 import pytest
 from flight_harness import open_flight, open_px4
 from plan_flights import near_home, sent_for_plans
@@ -69,6 +70,30 @@ async def test_ardupilot_counts_an_extra_circle() -> None:
         await flight.vehicle.fence.upload(wider, method="items")
         assert len(flight.wire.all(m.MissionItemInt)) == 1
         assert wider.matches(await flight.vehicle.fence.download(), ItemStorage.ARDUPILOT)
+
+
+@pytest.mark.parametrize("method", ["auto", "items"])
+@pytest.mark.parametrize("verify", [True, False])
+@pytest.mark.parametrize("latency_s", [0.0, 0.2])
+async def test_small_fence_after_larger_one_remains(method: Any, verify: bool, latency_s: float) -> None:
+    """ArduCopter erases a fence of one or two circles that replaces a larger one, just after it has confirmed it."""
+    circle = Fence(circles=[FenceCircle(place(0, 0), 100.0)])
+    async with open_flight(latency_s=latency_s) as flight:
+        await flight.vehicle.fence.upload(FENCE, method=method)
+        await flight.vehicle.fence.upload(circle, method=method, verify=verify)
+        await anyio.sleep(2)
+        assert len(flight.copter.missions.items(1)) == 1
+
+
+async def test_erased_fence_after_cancelled_upload_is_sent_again() -> None:
+    circle = Fence(circles=[FenceCircle(place(0, 0), 100.0)])
+    async with open_flight() as flight:
+        await flight.vehicle.fence.upload(FENCE)
+        with anyio.move_on_after(0.3):
+            await flight.vehicle.fence.upload(circle)
+        assert flight.copter.missions.items(1) == []
+        await flight.vehicle.fence.upload(circle)
+        assert len(flight.copter.missions.items(1)) == 1
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])

@@ -16,7 +16,7 @@ from aerokit.errors import (
     RemoteProtocolError,
     VerificationFailed,
 )
-from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavProtocolCapability
+from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType, MavProtocolCapability
 from aerokit.missions.compare import ItemStorage, changed_items, item_differences
 from aerokit.missions.wire import PACKED_PATHS, pack_items, shift_jumps, unpack_items, with_home
 from aerokit.protocols.mission_download import DownloadResult, MissionDownload
@@ -214,6 +214,10 @@ class PlanChannel:
         return "; the vehicle still has its previous items"
 
 
+# ArduPilot erases a small fence within 0.1 s after its upload; see `PlanTransfer._is_erased`.
+FENCE_ERASED_WITHIN_S = 0.5
+MIN_KEPT_ZONE_POINTS = 3
+
 PLAN_NAMES = ("mission", "fence", "rally points")
 # MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
 CHECKSUM_INTERVAL_S = 1.0
@@ -268,11 +272,15 @@ class PlanTransfer(Generic[PlanT]):
         if only_changes and await self._send_changes(items, method, verify=verify):
             return  # The vehicle has the plan now.
         self._cache.forget(self._context.now())
-        if await self._uses_file(method, is_upload=True):
-            with self._describe_file_timeout(method, f"; {UNKNOWN_CONTENT}", missing=range(len(items) - self._offset)):
-                await self._send_file(items, method)
+        try:
+            await self._send_all(items, method, verify=verify)
+        except (VerificationFailed, MissionRejected):
+            if not await self._is_erased(items):
+                raise
         else:
-            await self._send_items(items, method, verify=verify)
+            if not await self._is_erased(items):
+                return
+        await self._send_items(items, method, verify=True)
 
     async def download(self, method: str) -> PlanT:
         with self._describe_file_timeout(method):
@@ -286,6 +294,26 @@ class PlanTransfer(Generic[PlanT]):
         remaining = received.count - self._offset
         if remaining > 0:
             raise self._mismatch((f"the vehicle still has items: {remaining}",))
+
+    async def _is_erased(self, items: Sequence[MissionItem]) -> bool:
+        """Return True if the vehicle has just erased a fence of one or two circles.
+
+        Its FENCE_TOTAL is 0. If that was not 0 before, ArduPilot takes the change for an order to erase the fence
+        (AC_PolyFence_loader.cpp, write_fence and update). The same fence then remains after its next upload.
+        """
+        zone_points = sum(item.command != MavCmd.NAV_FENCE_RETURN_POINT for item in items)
+        is_small_fence = self._mission_type == MavMissionType.FENCE and zone_points < MIN_KEPT_ZONE_POINTS
+        if not (is_small_fence and self._context.autopilot.erases_small_fences):
+            return False
+        uploaded = self._cache.items
+        self._cache.forget(self._context.now())  # This call may fail or be cancelled.
+        changes = self._cache.changes
+        await anyio.sleep(FENCE_ERASED_WITHIN_S)
+        if (await self._channel.receive(only=())).count == 0:
+            return True
+        if uploaded is not None and self._cache.changes == changes:
+            self._cache.set(uploaded, self._context.now())
+        return False
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
         while True:
@@ -342,6 +370,13 @@ class PlanTransfer(Generic[PlanT]):
                 raise MissionTimeout(f"{self._name}: {text}", missing=tuple(missing)) from None
             error.args = (text,)
             raise
+
+    async def _send_all(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
+        if await self._uses_file(method, is_upload=True):
+            with self._describe_file_timeout(method, f"; {UNKNOWN_CONTENT}", missing=range(len(items) - self._offset)):
+                await self._send_file(items, method)
+        else:
+            await self._send_items(items, method, verify=verify)
 
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
         result = await self._channel.send(items)
