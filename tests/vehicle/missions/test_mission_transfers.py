@@ -279,6 +279,17 @@ async def test_upload_by_file_applied_before_silence_is_unknown() -> None:
         assert flight.copter.missions.items(1)
 
 
+async def test_upload_during_another_stations_upload_does_not_vouch_for_old_items() -> None:
+    encoder = FrameEncoder(77, 191)
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(5))
+        flight.vehicle.connection.link.write(encoder.encode(m.MissionCount(1, 1, 2)))
+        with pytest.raises(MissionRejected, match="stored none of the new items") as caught:
+            await flight.vehicle.mission.upload(long_mission(8), method="items")
+        assert "previous items" not in str(caught.value)
+        assert not holds(flight, long_mission(5))
+
+
 async def test_rejected_first_item_is_not_called_new() -> None:
     async with open_flight() as flight:
         await flight.vehicle.mission.upload(long_mission(3))

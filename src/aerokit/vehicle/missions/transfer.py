@@ -170,7 +170,8 @@ class PlanChannel:
             self._record_changes(exchange)
             await anyio.sleep(REFUSAL_TEXT_DELAY_S)
             texts = self._context.session.texts_since(started_at)
-            message = f"{error}{self._describe_items_on_vehicle(exchange, refused_item=error.item)}"
+            description = self._describe_items_on_vehicle(exchange, refused_item=error.item, result=error.result)
+            message = f"{error}{description}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
             self._record_changes(exchange)
@@ -188,7 +189,12 @@ class PlanChannel:
             self._has_changed |= exchange.may_have_changed_items
 
     def _describe_items_on_vehicle(
-        self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused_item: int | None = None
+        self,
+        exchange: MissionExchange[Any],
+        *,
+        is_silent: bool = False,
+        refused_item: int | None = None,
+        result: int | None = None,
     ) -> str:
         """Return a clause for the error text of an upload: which items the vehicle has now."""
         if not isinstance(exchange, MissionUpload):
@@ -211,6 +217,8 @@ class PlanChannel:
             return f"; the vehicle now {has} some new and some old items: upload again, or clear"
         if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT alone cuts the plan.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
+        if result == MavMissionResult.DENIED:  # Another station may be replacing the items.
+            return "; it has stored none of the new items"
         return "; the vehicle still has its previous items"
 
 
