@@ -279,7 +279,7 @@ async def test_upload_by_file_applied_before_silence_is_unknown() -> None:
         assert flight.copter.missions.items(1)
 
 
-async def test_upload_during_another_stations_upload_does_not_vouch_for_old_items() -> None:
+async def test_upload_denied_by_other_upload_does_not_mention_old_items() -> None:
     encoder = FrameEncoder(77, 191)
     async with open_flight() as flight:
         await flight.vehicle.mission.upload(long_mission(5))
