@@ -325,8 +325,8 @@ def test_upload_respects_server_queue() -> None:
     ]
 
 
-def test_upload_of_virtual_file_sends_first_block_last() -> None:
-    upload = FtpUpload(make_client(), "@PARAM/param.pck", content(500), session=1)
+def test_upload_sends_first_block_last() -> None:
+    upload = FtpUpload(make_client(), "@PARAM/param.pck", content(500), session=1, first_block_last=True)
     upload.start(0.0)
     offsets = []
     while not upload.done:

@@ -242,6 +242,8 @@ class Autopilot:
     """MAV_MISSION_TYPEs whose old items are overwritten during an upload. For other types, old items stay until the
     upload is complete.
     """
+    evaluates_incomplete_files = False
+    """True if an incomplete upload of a virtual file, such as ``@PARAM/param.pck``, takes effect when it is closed."""
     erases_small_fences = False
     """True if a new fence of one or two circles may be erased just after its upload."""
     mission_completes_at_home = False

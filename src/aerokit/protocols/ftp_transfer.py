@@ -368,18 +368,25 @@ class FtpDownload(FtpExchange[int]):
 class FtpUpload(FtpExchange[None]):
     """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged.
 
-    The first block of a virtual file, whose name begins with ``@``, is sent when all others are acknowledged. ArduPilot
-    evaluates such a file when it is closed, also after an interrupted upload. Only without the magic number in the
-    first block does it ignore an incomplete file: of ``@PARAM/param.pck`` it sets all parameters that have arrived, one
-    of them to 0 or to a part of its value (AP_Filesystem_Param.cpp, param_upload_parse).
+    With ``first_block_last``, the first block is sent when all others are acknowledged. ArduPilot evaluates a virtual
+    file, whose name begins with ``@``, when it is closed, also after an interrupted upload. Only without the magic
+    number in the first block does it ignore an incomplete file: of ``@PARAM/param.pck`` it sets all parameters that
+    have arrived, one of them to 0 or to a part of its value (AP_Filesystem_Param.cpp, param_upload_parse).
     """
 
     def __init__(
-        self, client: FtpClient, path: str, data: bytes, *, session: int, **options: Unpack[TransferOptions]
+        self,
+        client: FtpClient,
+        path: str,
+        data: bytes,
+        *,
+        session: int,
+        first_block_last: bool = False,
+        **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(client, path, **options)
         self._data = data
-        self._is_first_block_held = is_virtual(path)
+        self._is_first_block_held = first_block_last
         self._session = session
         self._requests = BlockRequests(self.round_trip)
         self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))  # offsets of the blocks not yet acknowledged

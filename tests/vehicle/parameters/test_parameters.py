@@ -646,6 +646,18 @@ async def test_interrupted_upload_by_file_sets_no_parameter(lost: int) -> None:
         assert {name: flight.copter.parameters[name] for name in values} == {name: table[name].value for name in values}
 
 
+async def test_px4_upload_by_file_arrives_in_order() -> None:
+    """PX4 sets parameters as they arrive, and refuses a file with a gap."""
+    async with open_px4(px4(parameter_file=True)) as flight:
+        parameters = flight.vehicle.parameters
+        table = await parameters.download()
+        values = {p.name: p.value + 1 for p in table.values() if p.type is ParameterType.INT32 and p.value < 1e6}
+        assert len(pack_parameters(table[name] for name in values)) > 239
+        await parameters.upload(values, method="ftp")
+        assert {name: flight.px4.parameters[name] for name in values} == values
+        assert sent_writes(flight) == []
+
+
 async def test_upload_by_file_without_changes_sends_no_file() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
