@@ -15,6 +15,7 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, waypoint
 from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
+from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
 
@@ -104,6 +105,18 @@ async def test_refused_fence_keeps_the_old_one(opened: Any) -> None:
         with pytest.raises(MissionRejected, match="the vehicle still has its previous items"):
             await flight.vehicle.fence.upload(many, method="items")
         assert FENCE.matches(await flight.vehicle.fence.download())
+
+
+@pytest.mark.parametrize("method", ["items", "auto"])
+async def test_download_from_starting_vehicle_waits_for_fence(method: Any) -> None:
+    """ArduCopter and Rover report no fence until they have started, although they have stored one."""
+    copter = SimulatedCopter(boot_time_s=4.0)
+    copter.missions.replace(1, FENCE.to_items())
+    copter.missions.reset()
+    async with open_flight(copter) as flight:
+        assert not copter.is_initialised
+        assert FENCE.matches(await flight.vehicle.fence.download(method=method))
+        assert copter.is_initialised or method == "auto"
 
 
 async def test_fence_enable_and_disable() -> None:

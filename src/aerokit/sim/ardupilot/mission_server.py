@@ -55,6 +55,7 @@ class ArduPilotMissionServer(MissionServer):
         """The mission."""
         self.fence: FenceList = FenceList(self._on_fence_total)
         self._fence_total = 0
+        self._was_fence_stored = False  # since the boot
         self.rally: RallyList = RallyList(_MAX_RALLY_POINTS)
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,
@@ -67,6 +68,10 @@ class ArduPilotMissionServer(MissionServer):
     def listen(self) -> None:
         super().listen()
         self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
+
+    def reset(self) -> None:
+        super().reset()
+        self._was_fence_stored = False
 
     def items(self, mission_type: int) -> list[MissionItem]:
         items = self._lists.get(mission_type)
@@ -113,7 +118,14 @@ class ArduPilotMissionServer(MissionServer):
         return self._lists[mission_type].capacity
 
     def count(self, mission_type: int) -> int:
+        if mission_type == MavMissionType.FENCE and self._is_fence_hidden:
+            return 0
         return self._lists[mission_type].count
+
+    @property
+    def _is_fence_hidden(self) -> bool:
+        # The firmware counts the items in its storage at the end of its boot, or when it stores a fence.
+        return not self._vehicle.is_initialised and not self._was_fence_stored
 
     def _key(self, mission_type: int) -> int:
         return mission_type
@@ -259,6 +271,7 @@ class ArduPilotMissionServer(MissionServer):
         This is an error of the firmware, which also erases a new fence of one or two circles that replaces a larger one
         (AC_PolyFence_loader.cpp, update, which runs at 10 Hz).
         """
+        self._was_fence_stored = True
         before, self._fence_total = self._fence_total, total
         if total == 0 and before:
             self._host.call_at(self._host.now + _FENCE_UPDATE_INTERVAL_S, self._erase_fence)

@@ -22,6 +22,7 @@ from aerokit.missions.wire import PACKED_PATHS, pack_items, shift_jumps, unpack_
 from aerokit.protocols.mission_download import DownloadResult, MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload, UploadResult
 from aerokit.protocols.missions import MissionClear, mission_checksum
+from aerokit.vehicle.commanding.arming import BOOT_STATES
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -226,6 +227,8 @@ class PlanChannel:
 FENCE_ERASED_WITHIN_S = 0.5
 MIN_KEPT_ZONE_POINTS = 3
 
+MAX_BOOT_S = 10.0
+
 PLAN_NAMES = ("mission", "fence", "rally points")
 # MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
 CHECKSUM_INTERVAL_S = 1.0
@@ -327,9 +330,23 @@ class PlanTransfer(Generic[PlanT]):
         while True:
             changes = self._cache.changes
             received = await self._receive(method)
+            if not received.items and await self._was_fence_hidden():
+                continue
             if self._cache.changes == changes:  # No other station has changed the plan meanwhile.
                 self._cache.set(received.items, self._context.now(), received.opaque_id)
                 return received.items
+
+    async def _was_fence_hidden(self) -> bool:
+        """Return True if the vehicle was still starting, and has started now."""
+        # ArduPilot reads its fence from storage at the end of its boot, 2.4 s after it has answered the first message.
+        # Until then, it reports an empty fence.
+        status = self._context.session.telemetry.system_status
+        hides_fence = self._context.autopilot.hides_fence_at_boot and self._mission_type == MavMissionType.FENCE
+        if not hides_fence or status.latest not in BOOT_STATES:
+            return False
+        with anyio.move_on_after(MAX_BOOT_S):
+            await status.wait_until(lambda state: state not in BOOT_STATES, description="the end of the boot")
+        return status.latest not in BOOT_STATES
 
     async def _receive(self, method: str) -> DownloadResult:
         if await self._uses_file(method):
