@@ -325,6 +325,17 @@ def test_upload_respects_server_queue() -> None:
     ]
 
 
+def test_upload_sends_first_block_last() -> None:
+    upload = FtpUpload(make_client(), "@PARAM/param.pck", content(500), session=1, first_block_last=True)
+    upload.start(0.0)
+    offsets = []
+    while not upload.done:
+        for write in requests_in(upload.take_outbox()):
+            offsets.append(write.offset)
+            upload.receive(as_message(reply_to(write)), 0.1)
+    assert offsets == [239, 478, 0]
+
+
 def test_upload_refusal() -> None:
     for code, kind in ((MavFtpErr.FAIL, FileError), (MavFtpErr.INVALIDSESSION, FtpSessionLost)):
         upload = FtpUpload(make_client(), "/a", content(500), session=1)

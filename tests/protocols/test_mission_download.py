@@ -214,7 +214,8 @@ def test_mission_clear_refused() -> None:
     exchange.start(0.0)
     exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.1)
     assert exchange.take_outbox() == [m.MissionClearAll(1, 1)] * 2
-    exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.2)
+    exchange.expire(1.4)
+    exchange.receive(m.MissionAck(*GCS, Result.ERROR), 1.6)
     with pytest.raises(MissionRejected):
         exchange.result()
 
@@ -222,9 +223,9 @@ def test_mission_clear_refused() -> None:
 def test_mission_clear_errors_for_late_items_are_no_refusal() -> None:
     exchange = MissionClear(1, 1, round_trip=RoundTrip(0.5))
     exchange.start(0.0)
-    for number in range(2):
-        exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.1 + number / 10)
-    exchange.receive(m.MissionAck(*GCS, Result.ACCEPTED), 0.5)
+    for now in (0.1, 0.2, 0.5, 0.6):
+        exchange.receive(m.MissionAck(*GCS, Result.ERROR), now)
+    exchange.receive(m.MissionAck(*GCS, Result.ACCEPTED), 0.7)
     assert exchange.done
     exchange.result()
 

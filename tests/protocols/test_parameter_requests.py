@@ -293,6 +293,17 @@ def test_other_value_is_accepted_when_repeated_consecutively() -> None:
     assert value(exchange.result()["A"]) == 4
 
 
+def test_copies_of_late_answer_do_not_confirm_restored_value() -> None:
+    """A block that restored SERVO8_MAX of an ArduCopter took two answers to its earlier reads for the confirmation."""
+    exchange = writes(Parameter("A", 5, INT32), recent=["A"], round_trip=RoundTrip(2.0))
+    exchange.start(0.0)
+    for now in (0.4, 0.4, 0.5):
+        exchange.receive(value_message(Parameter("A", 5, INT32), 1, bytewise=False), now)
+    assert not exchange.done
+    exchange.receive(value_message(Parameter("A", 5, INT32), 1, bytewise=False), 2.4)
+    assert value(exchange.result()["A"]) == 5
+
+
 def test_parameter_refusal_has_text() -> None:
     vehicle = FakeVehicle([])
     vehicle.refuses = True

@@ -177,6 +177,9 @@ class ArduPilot(Autopilot):
     mission_download_window = 10
     writes_partial_missions = True
     overwrites_plans_in_place: frozenset[int] = frozenset((0, 2))
+    evaluates_incomplete_files = True
+    hides_fence_at_boot = True
+    erases_small_fences = True
     mission_completes_at_home = True
     mission_starts_by_command = True
     sets_current_by_command = True

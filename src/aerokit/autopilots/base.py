@@ -242,6 +242,12 @@ class Autopilot:
     """MAV_MISSION_TYPEs whose old items are overwritten during an upload. For other types, old items stay until the
     upload is complete.
     """
+    evaluates_incomplete_files = False
+    """True if an incomplete upload of a virtual file, such as ``@PARAM/param.pck``, takes effect when it is closed."""
+    hides_fence_at_boot = False
+    """True if no fence is reported until the autopilot has started, even if it has stored one."""
+    erases_small_fences = False
+    """True if a new fence of one or two circles may be erased just after its upload."""
     mission_completes_at_home = False
     """True if a mission that ends with a return is reported as complete at home, False if when it starts to return."""
     holds_after_mission = False

@@ -366,13 +366,27 @@ class FtpDownload(FtpExchange[int]):
 
 
 class FtpUpload(FtpExchange[None]):
-    """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged."""
+    """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged.
+
+    With ``first_block_last``, the first block is sent when all others are acknowledged. ArduPilot evaluates a virtual
+    file, whose name begins with ``@``, when it is closed, also after an interrupted upload. Only without the magic
+    number in the first block does it ignore an incomplete file: of ``@PARAM/param.pck`` it sets all parameters that
+    have arrived, one of them to 0 or to a part of its value (AP_Filesystem_Param.cpp, param_upload_parse).
+    """
 
     def __init__(
-        self, client: FtpClient, path: str, data: bytes, *, session: int, **options: Unpack[TransferOptions]
+        self,
+        client: FtpClient,
+        path: str,
+        data: bytes,
+        *,
+        session: int,
+        first_block_last: bool = False,
+        **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(client, path, **options)
         self._data = data
+        self._is_first_block_held = first_block_last
         self._session = session
         self._requests = BlockRequests(self.round_trip)
         self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))  # offsets of the blocks not yet acknowledged
@@ -382,7 +396,8 @@ class FtpUpload(FtpExchange[None]):
     def start(self, now: float) -> None:
         self._start_clock(now)
         for offset in self._unwritten:
-            self._requests.request(offset)
+            if offset or not self._is_first_block_held:
+                self._requests.request(offset)
         self._proceed(now)
 
     def expire(self, now: float) -> None:
@@ -420,6 +435,9 @@ class FtpUpload(FtpExchange[None]):
         if not self._unwritten:
             self._finish(None)
             return
+        if self._is_first_block_held and list(self._unwritten) == [0]:
+            self._is_first_block_held = False
+            self._requests.request(0)
         for offset in self._requests.take_due(now):
             self._write(offset, now)
         due_at = self._requests.deadline

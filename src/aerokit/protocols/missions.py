@@ -43,6 +43,9 @@ BUSY_TIMEOUT_S = 9.0
 
 BUSY_RETRY_INTERVAL_S = 1.0
 
+# Seconds after a MISSION_CLEAR_ALL in which an ERROR may answer items of an earlier upload.
+LATE_ERRORS_S = 1.5
+
 # The time-out grows during the first GROWING_ATTEMPTS attempts, stays the same during the next CONSTANT_ATTEMPTS
 # attempts, and then grows again.
 GROWING_ATTEMPTS, CONSTANT_ATTEMPTS = 5, 7
@@ -166,11 +169,16 @@ class MissionClear(MissionExchange[None]):
             # This ERROR may answer a late item of an earlier upload, so the request is repeated once.
             self._has_error = True
             self._repeat(now)
-        elif message.type == MavMissionResult.ERROR and now - self._sent_at < (self.round_trip.fastest_s or 0.0) / 2:
-            return  # This ERROR is too early to answer the repeated request.
+        elif message.type == MavMissionResult.ERROR and self._may_be_late_error(now):
+            return  # The request is repeated when its answer is overdue.
         # OPERATION_CANCELLED and INVALID_SEQUENCE answer an earlier upload, so they are ignored.
         elif message.type not in (MavMissionResult.OPERATION_CANCELLED, MavMissionResult.INVALID_SEQUENCE):
             self._reject(message.type)
+
+    def _may_be_late_error(self, now: float) -> bool:
+        # Each late copy of an item of an earlier upload is answered by an ERROR.
+        is_too_early = now - self._sent_at < (self.round_trip.fastest_s or 0.0) / 2
+        return is_too_early or now - self._started_at < min(LATE_ERRORS_S, self._idle_timeout_s / 2)
 
     def expire(self, now: float) -> None:
         if self._is_idle(now):

@@ -250,6 +250,8 @@ class ParameterWrites(ParameterRequests):
             answers.add(reported)
             self._request_again(name, now)
             return
+        if is_as_requested and name in self._recently_written and self._is_too_early(name, now, may_measure=False):
+            return  # Another late answer to the earlier call, not the answer to the read.
         # The requested value with another type is accepted when it is reported a second time.
         if is_as_requested and (reported.type == requested.type or answers.ends_with(reported)):
             self._window.on_answer(name, now)
@@ -263,8 +265,7 @@ class ParameterWrites(ParameterRequests):
         With ``is_as_requested``, only the type of the value is unexpected.
         """
         answers = self._repeated_answers[name]
-        sent_at = self._sent_at.get(name, now)
-        if self._stale_answers.is_stale(name, sent_at, now, may_measure=self._window.attempts(name) == 1):
+        if self._is_too_early(name, now, may_measure=self._window.attempts(name) == 1):
             return
         answers.add(reported)
         before = self._before.get(name)  # None if unknown
@@ -280,6 +281,10 @@ class ParameterWrites(ParameterRequests):
             self._set_result(name, reported, now)
         else:
             self._request_again(name, now)
+
+    def _is_too_early(self, name: str, now: float, *, may_measure: bool) -> bool:
+        """Return True if the answer cannot belong to the latest request for this name."""
+        return self._stale_answers.is_stale(name, self._sent_at.get(name, now), now, may_measure=may_measure)
 
     def _with_integer_type(self, reported: Parameter, type_: ParameterType) -> Parameter:
         # If the value is the default, ArduPilot's answer to PARAM_SET reports an integer parameter as a float.

@@ -2452,7 +2452,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
+            FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(
@@ -2660,7 +2660,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
+            FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(
@@ -2765,7 +2765,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
+            FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
         self._loop.run(

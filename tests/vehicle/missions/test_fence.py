@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import anyio
 import pytest
 from flight_harness import open_flight, open_px4
 from plan_flights import near_home, sent_for_plans
@@ -14,6 +15,7 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, waypoint
 from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
+from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
 
@@ -71,6 +73,30 @@ async def test_ardupilot_counts_an_extra_circle() -> None:
         assert wider.matches(await flight.vehicle.fence.download(), ItemStorage.ARDUPILOT)
 
 
+@pytest.mark.parametrize("method", ["auto", "items"])
+@pytest.mark.parametrize("verify", [True, False])
+@pytest.mark.parametrize("latency_s", [0.0, 0.2])
+async def test_small_fence_after_larger_one_remains(method: Any, verify: bool, latency_s: float) -> None:
+    """ArduCopter erases a fence of one or two circles that replaces a larger one, just after it has confirmed it."""
+    circle = Fence(circles=[FenceCircle(place(0, 0), 100.0)])
+    async with open_flight(latency_s=latency_s) as flight:
+        await flight.vehicle.fence.upload(FENCE, method=method)
+        await flight.vehicle.fence.upload(circle, method=method, verify=verify)
+        await anyio.sleep(2)
+        assert len(flight.copter.missions.items(1)) == 1
+
+
+async def test_erased_fence_after_cancelled_upload_is_sent_again() -> None:
+    circle = Fence(circles=[FenceCircle(place(0, 0), 100.0)])
+    async with open_flight() as flight:
+        await flight.vehicle.fence.upload(FENCE)
+        with anyio.move_on_after(0.3):
+            await flight.vehicle.fence.upload(circle)
+        assert flight.copter.missions.items(1) == []
+        await flight.vehicle.fence.upload(circle)
+        assert len(flight.copter.missions.items(1)) == 1
+
+
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
 async def test_refused_fence_keeps_the_old_one(opened: Any) -> None:
     async with opened() as flight:
@@ -79,6 +105,18 @@ async def test_refused_fence_keeps_the_old_one(opened: Any) -> None:
         with pytest.raises(MissionRejected, match="the vehicle still has its previous items"):
             await flight.vehicle.fence.upload(many, method="items")
         assert FENCE.matches(await flight.vehicle.fence.download())
+
+
+@pytest.mark.parametrize("method", ["items", "auto"])
+async def test_download_from_starting_vehicle_waits_for_fence(method: Any) -> None:
+    """ArduCopter and Rover report no fence until they have started, although they have stored one."""
+    copter = SimulatedCopter(boot_time_s=4.0)
+    copter.missions.replace(1, FENCE.to_items())
+    copter.missions.reset()
+    async with open_flight(copter) as flight:
+        assert not copter.is_initialised
+        assert FENCE.matches(await flight.vehicle.fence.download(method=method))
+        assert copter.is_initialised or method == "auto"
 
 
 async def test_fence_enable_and_disable() -> None:

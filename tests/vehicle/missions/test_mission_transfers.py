@@ -22,12 +22,14 @@ from aerokit.errors import (
     VerificationFailed,
 )
 from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import MavFtpOpcode
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
 from aerokit.protocols.exchange import TransferProgress
+from aerokit.protocols.ftp import FtpMessage
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
@@ -208,6 +210,24 @@ async def test_px4_plan_changed_by_another_station() -> None:
         assert holds(flight, long_mission(5))
 
 
+async def test_interrupted_upload_by_file_keeps_mission() -> None:
+    """The last block of 24 items has four bytes: without it, the altitude of the last item is above sea level."""
+    async with open_flight(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(5))
+        handle = flight.copter.handlers[m.FileTransferProtocol.ID]
+
+        def lose_last_block(message: Any, *more: Any) -> None:
+            request = FtpMessage.decode(bytes(message.payload))
+            if (request.opcode, request.offset) != (MavFtpOpcode.WRITEFILE, 956):
+                handle(message, *more)
+
+        flight.copter.handlers[m.FileTransferProtocol.ID] = lose_last_block
+        with anyio.move_on_after(2):
+            await flight.vehicle.mission.upload(long_mission(24), method="ftp")
+        await anyio.sleep(1)
+        assert holds(flight, long_mission(5))
+
+
 # ---------------------------------------------------------------------------------------- refusals
 
 
@@ -222,10 +242,60 @@ async def test_rejected_upload_names_item_and_remains(opened: Any, method: Any) 
         assert (caught.value.item, caught.value.result) == (17, Result.UNSUPPORTED)
         keeps = opened is open_px4
         assert ("still has its previous items" in str(caught.value)) == keeps
-        assert ("items 0 to 16 are new now, and all later items are old" in str(caught.value)) != keeps
+        assert ("items 0 to 16 are new now, and later items, if there are any, are old" in str(caught.value)) != keeps
         assert holds(flight, long_mission(30)) == keeps
+        # A file clears ArduPilot's mission first; MISSION_COUNT cuts it.
+        assert len(held_by(flight)) == (30 if keeps else 17 if method == "auto" else 22)
         await flight.vehicle.mission.upload(long_mission(30))  # it was not recorded as uploaded
         assert holds(flight, long_mission(30))
+
+
+async def test_upload_by_file_without_answer_raises_mission_timeout() -> None:
+    async with open_flight(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(5))
+        await flight.vehicle.mission.download()
+        flight.copter.faults.silent = True
+        with pytest.raises(MissionTimeout, match="whether the vehicle has the new items is unknown") as caught:
+            await flight.vehicle.mission.upload(long_mission(6), only_changes=False)
+        assert caught.value.missing == tuple(range(6))
+        with pytest.raises(MissionTimeout):
+            await flight.vehicle.mission.download()
+
+
+async def test_upload_by_file_applied_before_silence_is_unknown() -> None:
+    fence = Fence(circles=[FenceCircle(Position(*near_home(0)), 100)])
+    async with open_flight(latency_s=0.02) as flight:
+        handle = flight.copter.handlers[m.FileTransferProtocol.ID]
+
+        def fall_silent_after_close(message: Any, *more: Any) -> None:
+            flight.copter.faults.silent = (
+                FtpMessage.decode(bytes(message.payload)).opcode == MavFtpOpcode.TERMINATESESSION
+            )
+            handle(message, *more)
+
+        flight.copter.handlers[m.FileTransferProtocol.ID] = fall_silent_after_close
+        with pytest.raises(MissionTimeout, match="whether the vehicle has the new items is unknown"):
+            await flight.vehicle.fence.upload(fence)
+        assert flight.copter.missions.items(1)
+
+
+async def test_upload_denied_by_other_upload_does_not_mention_old_items() -> None:
+    encoder = FrameEncoder(77, 191)
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(5))
+        flight.vehicle.connection.link.write(encoder.encode(m.MissionCount(1, 1, 2)))
+        with pytest.raises(MissionRejected, match="stored none of the new items") as caught:
+            await flight.vehicle.mission.upload(long_mission(8), method="items")
+        assert "previous items" not in str(caught.value)
+        assert not holds(flight, long_mission(5))
+
+
+async def test_rejected_first_item_is_not_called_new() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(3))
+        with pytest.raises(MissionRejected, match="no item is new, and old items may be missing"):
+            await flight.vehicle.mission.upload(Mission([UNKNOWN]), method="items")
+        assert holds(flight, long_mission(1))
 
 
 async def test_rejected_partial_upload() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import struct
 import sys
 import warnings
@@ -24,10 +25,11 @@ from aerokit.errors import (
     ParameterTimeout,
 )
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavFtpErr
+from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavFtpOpcode
 from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterTable, ParameterType
 from aerokit.parameters.pack import pack_parameters
 from aerokit.protocols.exchange import TransferProgress
+from aerokit.protocols.ftp import FtpMessage
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink
 from aerokit.vehicle.connect import connect
@@ -620,6 +622,40 @@ async def test_lost_write_after_cancelled_one_is_repeated() -> None:
         flight.copter.handlers[messages.ParamSet.ID] = lose_first
         assert (await parameters.set("RTL_ALT", 2500)).outcome == "set"
         assert flight.copter.parameters["RTL_ALT"] == 2500
+
+
+@pytest.mark.parametrize("lost", [0, 239, 478])
+async def test_interrupted_upload_by_file_sets_no_parameter(lost: int) -> None:
+    """A SERVO10_MAX of 1879 became 0 on ArduCopter, which evaluates what has arrived when the file is closed."""
+    async with open_flight(SimulatedCopter(boot_time_s=0.0), latency_s=0.02) as flight:
+        parameters = flight.vehicle.parameters
+        table = await parameters.download()
+        handle = flight.copter.handlers[messages.FileTransferProtocol.ID]
+
+        def lose_block(message: Any, *more: Any) -> None:
+            request = FtpMessage.decode(bytes(message.payload))
+            if (request.opcode, request.offset) != (MavFtpOpcode.WRITEFILE, lost):
+                handle(message, *more)
+
+        flight.copter.handlers[messages.FileTransferProtocol.ID] = lose_block
+        values = {name: table[name].value + 1 for name in table if re.fullmatch(r"(SERVO|RC)\d+_(MIN|MAX|TRIM)", name)}
+        assert len(pack_parameters(table[name] for name in values)) > 478
+        with anyio.move_on_after(2):
+            await parameters.upload(values, method="ftp")
+        await anyio.sleep(1)
+        assert {name: flight.copter.parameters[name] for name in values} == {name: table[name].value for name in values}
+
+
+async def test_px4_upload_by_file_arrives_in_order() -> None:
+    """PX4 sets parameters as they arrive, and refuses a file with a gap."""
+    async with open_px4(px4(parameter_file=True)) as flight:
+        parameters = flight.vehicle.parameters
+        table = await parameters.download()
+        values = {p.name: p.value + 1 for p in table.values() if p.type is ParameterType.INT32 and p.value < 1e6}
+        assert len(pack_parameters(table[name] for name in values)) > 239
+        await parameters.upload(values, method="ftp")
+        assert {name: flight.px4.parameters[name] for name in values} == values
+        assert sent_writes(flight) == []
 
 
 async def test_upload_by_file_without_changes_sends_no_file() -> None:

@@ -218,8 +218,11 @@ class FenceList(ItemList):
 
     name = "Fence"
 
-    def __init__(self, capacity: int = _STORAGE_BYTES // _BYTES_PER_POINT) -> None:
+    def __init__(
+        self, on_total: Callable[[int], None] = lambda _: None, capacity: int = _STORAGE_BYTES // _BYTES_PER_POINT
+    ) -> None:
         super().__init__(capacity)
+        self._on_total = on_total  # called with the new FENCE_TOTAL after each change of the stored fence
         self._stored: list[MissionItem] = []
         # Items of the running upload, with None for each missing item. None if no upload is running.
         self._uploaded: list[MissionItem | None] | None = None
@@ -258,8 +261,14 @@ class FenceList(ItemList):
         self._uploaded = None
 
     def clear(self) -> bool:
-        self._stored = []
+        self._store([])
         return True
+
+    def _store(self, items: Sequence[MissionItem]) -> None:
+        self._stored = list(items)
+        # Fewer than three vertices and circles count as 0 (AC_PolyFence_loader.cpp, write_fence).
+        zone_points = sum(item.command != Cmd.NAV_FENCE_RETURN_POINT for item in items)
+        self._on_total(zone_points + 2 if zone_points >= 3 else 0)
 
     def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
         """Store a fence, or ``warn`` if it is invalid or too large."""
@@ -271,7 +280,7 @@ class FenceList(ItemList):
         if _storage_needed(items) > _STORAGE_BYTES:
             warn("Fence exceeds storage size")
             return MavMissionResult.ERROR
-        self._stored = list(items)
+        self._store(items)
         return MavMissionResult.ACCEPTED
 
     def replace(self, items: Sequence[MissionItem], warn: Warn) -> int:

@@ -36,6 +36,7 @@ from aerokit.sim.vehicle import sender_of
 _DEGREE = 1e7
 _MAX_COMMANDS, _MAX_RALLY_POINTS = 650, 46
 _GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3
+_FENCE_UPDATE_INTERVAL_S = 0.1
 
 
 class ArduPilotMissionServer(MissionServer):
@@ -52,7 +53,9 @@ class ArduPilotMissionServer(MissionServer):
             _MAX_COMMANDS, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
         )
         """The mission."""
-        self.fence: FenceList = FenceList()
+        self.fence: FenceList = FenceList(self._on_fence_total)
+        self._fence_total = 0
+        self._was_fence_stored = False  # since the boot
         self.rally: RallyList = RallyList(_MAX_RALLY_POINTS)
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,
@@ -65,6 +68,10 @@ class ArduPilotMissionServer(MissionServer):
     def listen(self) -> None:
         super().listen()
         self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
+
+    def reset(self) -> None:
+        super().reset()
+        self._was_fence_stored = False
 
     def items(self, mission_type: int) -> list[MissionItem]:
         items = self._lists.get(mission_type)
@@ -111,7 +118,14 @@ class ArduPilotMissionServer(MissionServer):
         return self._lists[mission_type].capacity
 
     def count(self, mission_type: int) -> int:
+        if mission_type == MavMissionType.FENCE and self._is_fence_hidden:
+            return 0
         return self._lists[mission_type].count
+
+    @property
+    def _is_fence_hidden(self) -> bool:
+        # The firmware counts the items in its storage at the end of its boot, or when it stores a fence.
+        return not self._vehicle.is_initialised and not self._was_fence_stored
 
     def _key(self, mission_type: int) -> int:
         return mission_type
@@ -250,6 +264,21 @@ class ArduPilotMissionServer(MissionServer):
         if is_cleared and items is self.commands:
             self._vehicle.mission.on_cleared()
         return is_cleared
+
+    def _on_fence_total(self, total: int) -> None:
+        """Erase the fence soon if its FENCE_TOTAL changes to 0, as by an old ground station.
+
+        This is an error of the firmware, which also erases a new fence of one or two circles that replaces a larger one
+        (AC_PolyFence_loader.cpp, update, which runs at 10 Hz).
+        """
+        self._was_fence_stored = True
+        before, self._fence_total = self._fence_total, total
+        if total == 0 and before:
+            self._host.call_at(self._host.now + _FENCE_UPDATE_INTERVAL_S, self._erase_fence)
+
+    def _erase_fence(self) -> None:
+        if self._fence_total == 0:
+            self.fence.clear()
 
     def _guide(self, item: MissionItem, current: int) -> int:
         stored_item = as_stored(item, self._vehicle.KIND)

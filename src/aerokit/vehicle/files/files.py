@@ -354,6 +354,7 @@ class Files:
             path,
             data,
             session=file.session,
+            first_block_last=is_virtual(path) and self._transfers.autopilot.evaluates_incomplete_files,
             round_trip=self._transfers.round_trip,
             idle_timeout_s=idle_timeout_s,
             on_progress=on_progress,

@@ -76,7 +76,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
             NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
-            FileError, FileTimeout: with ``"ftp"``: the vehicle refused an operation on a file, or did not answer.
+            FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
         plan = self._checked(plan)

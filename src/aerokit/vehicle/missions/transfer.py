@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 import anyio
@@ -15,12 +16,13 @@ from aerokit.errors import (
     RemoteProtocolError,
     VerificationFailed,
 )
-from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavProtocolCapability
+from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType, MavProtocolCapability
 from aerokit.missions.compare import ItemStorage, changed_items, item_differences
 from aerokit.missions.wire import PACKED_PATHS, pack_items, shift_jumps, unpack_items, with_home
 from aerokit.protocols.mission_download import DownloadResult, MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload, UploadResult
 from aerokit.protocols.missions import MissionClear, mission_checksum
+from aerokit.vehicle.commanding.arming import BOOT_STATES
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 ResultT = TypeVar("ResultT")
 # Seconds after a refusal in which the texts that explain it may arrive.
 REFUSAL_TEXT_DELAY_S = 0.3
+UNKNOWN_CONTENT = "whether the vehicle has the new items is unknown: call download()"
 
 
 class PlanChannel:
@@ -52,6 +55,7 @@ class PlanChannel:
         # Path of the plan's file on ArduPilot.
         self._path = PACKED_PATHS[mission_type]
         self._has_changed = False  # True if the vehicle may have received some of our items
+        self._may_have_read_file = False  # True if the vehicle may have evaluated a file of this call
         self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
@@ -97,7 +101,12 @@ class PlanChannel:
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
         """Write the plan's file. ArduPilot evaluates the file when it is closed, and does not report the result."""
-        await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
+        self._may_have_read_file = True
+        try:
+            await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
+        except FileError:
+            self._may_have_read_file = False  # The vehicle has no such file, or has refused a part of it.
+            raise
         self._has_changed = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
@@ -162,7 +171,8 @@ class PlanChannel:
             self._record_changes(exchange)
             await anyio.sleep(REFUSAL_TEXT_DELAY_S)
             texts = self._context.session.texts_since(started_at)
-            message = f"{error}{self._describe_items_on_vehicle(exchange, refused_item=error.item)}"
+            description = self._describe_items_on_vehicle(exchange, refused_item=error.item, result=error.result)
+            message = f"{error}{description}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
             self._record_changes(exchange)
@@ -180,7 +190,12 @@ class PlanChannel:
             self._has_changed |= exchange.may_have_changed_items
 
     def _describe_items_on_vehicle(
-        self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused_item: int | None = None
+        self,
+        exchange: MissionExchange[Any],
+        *,
+        is_silent: bool = False,
+        refused_item: int | None = None,
+        result: int | None = None,
     ) -> str:
         """Return a clause for the error text of an upload: which items the vehicle has now."""
         if not isinstance(exchange, MissionUpload):
@@ -189,16 +204,30 @@ class PlanChannel:
         is_partly_overwritten = overwrites_in_place and self._has_changed
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
+        if is_silent and self._may_have_read_file:
+            return f"; {UNKNOWN_CONTENT}"
         if is_partly_overwritten and refused_item:
+            # After the upload of a file there are no later items, because ArduPilot has cleared its plan first.
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
-            return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
+            later_items = "later items, if there are any, are old"
+            return f"; on the vehicle, {new_items} now, and {later_items}: upload again, or clear"
+        if is_partly_overwritten and refused_item == 0:
+            return "; on the vehicle, no item is new, and old items may be missing: upload again, or clear"
         if is_partly_overwritten:
             has = "may have" if is_silent else "has"
             return f"; the vehicle now {has} some new and some old items: upload again, or clear"
         if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT alone cuts the plan.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
+        if result == MavMissionResult.DENIED:  # Another station may be replacing the items.
+            return "; it has stored none of the new items"
         return "; the vehicle still has its previous items"
 
+
+# ArduPilot erases a small fence within 0.1 s after its upload; see `PlanTransfer._is_erased`.
+FENCE_ERASED_WITHIN_S = 0.5
+MIN_KEPT_ZONE_POINTS = 3
+
+MAX_BOOT_S = 10.0
 
 PLAN_NAMES = ("mission", "fence", "rally points")
 # MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
@@ -254,13 +283,20 @@ class PlanTransfer(Generic[PlanT]):
         if only_changes and await self._send_changes(items, method, verify=verify):
             return  # The vehicle has the plan now.
         self._cache.forget(self._context.now())
-        if await self._uses_file(method, is_upload=True):
-            await self._send_file(items, method)
+        try:
+            await self._send_all(items, method, verify=verify)
+        except (VerificationFailed, MissionRejected):
+            if not await self._is_erased(items):
+                raise
         else:
-            await self._send_items(items, method, verify=verify)
+            if not await self._is_erased(items):
+                return
+        await self._send_items(items, method, verify=True)
 
     async def download(self, method: str) -> PlanT:
-        return self._plan_type.from_items(await self._read(method), home_is_item_0=bool(self._offset))
+        with self._describe_file_timeout(method):
+            items = await self._read(method)
+        return self._plan_type.from_items(items, home_is_item_0=bool(self._offset))
 
     async def clear(self) -> None:
         self._cache.forget(self._context.now())
@@ -270,13 +306,47 @@ class PlanTransfer(Generic[PlanT]):
         if remaining > 0:
             raise self._mismatch((f"the vehicle still has items: {remaining}",))
 
+    async def _is_erased(self, items: Sequence[MissionItem]) -> bool:
+        """Return True if the vehicle has just erased a fence of one or two circles.
+
+        Its FENCE_TOTAL is 0. If that was not 0 before, ArduPilot takes the change for an order to erase the fence
+        (AC_PolyFence_loader.cpp, write_fence and update). The same fence then remains after its next upload.
+        """
+        zone_points = sum(item.command != MavCmd.NAV_FENCE_RETURN_POINT for item in items)
+        is_small_fence = self._mission_type == MavMissionType.FENCE and zone_points < MIN_KEPT_ZONE_POINTS
+        if not (is_small_fence and self._context.autopilot.erases_small_fences):
+            return False
+        uploaded = self._cache.items
+        self._cache.forget(self._context.now())  # This call may fail or be cancelled.
+        changes = self._cache.changes
+        await anyio.sleep(FENCE_ERASED_WITHIN_S)
+        if (await self._channel.receive(only=())).count == 0:
+            return True
+        if uploaded is not None and self._cache.changes == changes:
+            self._cache.set(uploaded, self._context.now())
+        return False
+
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
         while True:
             changes = self._cache.changes
             received = await self._receive(method)
+            if not received.items and await self._was_fence_hidden():
+                continue
             if self._cache.changes == changes:  # No other station has changed the plan meanwhile.
                 self._cache.set(received.items, self._context.now(), received.opaque_id)
                 return received.items
+
+    async def _was_fence_hidden(self) -> bool:
+        """Return True if the vehicle was still starting, and has started now."""
+        # ArduPilot reads its fence from storage at the end of its boot, 2.4 s after it has answered the first message.
+        # Until then, it reports an empty fence.
+        status = self._context.session.telemetry.system_status
+        hides_fence = self._context.autopilot.hides_fence_at_boot and self._mission_type == MavMissionType.FENCE
+        if not hides_fence or status.latest not in BOOT_STATES:
+            return False
+        with anyio.move_on_after(MAX_BOOT_S):
+            await status.wait_until(lambda state: state not in BOOT_STATES, description="the end of the boot")
+        return status.latest not in BOOT_STATES
 
     async def _receive(self, method: str) -> DownloadResult:
         if await self._uses_file(method):
@@ -311,6 +381,27 @@ class PlanTransfer(Generic[PlanT]):
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False
+
+    @contextmanager
+    def _describe_file_timeout(
+        self, method: str, consequence: str = "", *, missing: Sequence[int] = ()
+    ) -> Iterator[None]:
+        """Add the consequence to the text of a FileTimeout. Unless ``method`` is ``"ftp"``, raise a MissionTimeout."""
+        try:
+            yield
+        except FileTimeout as error:
+            text = f"{error}{consequence}"
+            if method != "ftp":
+                raise MissionTimeout(f"{self._name}: {text}", missing=tuple(missing)) from None
+            error.args = (text,)
+            raise
+
+    async def _send_all(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
+        if await self._uses_file(method, is_upload=True):
+            with self._describe_file_timeout(method, f"; {UNKNOWN_CONTENT}", missing=range(len(items) - self._offset)):
+                await self._send_file(items, method)
+        else:
+            await self._send_items(items, method, verify=verify)
 
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
         result = await self._channel.send(items)
@@ -359,7 +450,8 @@ class PlanTransfer(Generic[PlanT]):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
-        await self._read(method)  # Another station may have changed the plan.
+        with self._describe_file_timeout(method, "; the vehicle still has its previous items"):
+            await self._read(method)  # Another station may have changed the plan.
         changed_seqs = self._changed_seqs(items)
         if changed_seqs == []:  # The vehicle has these items already.
             return True
