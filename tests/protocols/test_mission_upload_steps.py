@@ -214,7 +214,7 @@ def test_items_are_sent_ahead_within_window() -> None:
     assert request_item(exchange, 0, 1.0) == [0, 1, 2]
     assert request_item(exchange, 2, 1.1) == [3, 4]
     assert exchange.was_sent_completely
-    assert request_item(exchange, 5, 1.2) == []  # no such item
+    assert request_item(exchange, 6, 1.2) == []  # no such item
     assert request_item(exchange, 4, 1.2) == []
     assert acknowledge(exchange, Result.ACCEPTED, 1.2) == []
     assert exchange.result() == UploadResult(True, 0, 4)

@@ -92,6 +92,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._is_item_refused = False
         self._restarts = 0
         self._busy_until: float | None = None
+        self._is_older_upload_open = False  # True if the vehicle still requests items of an earlier upload
         self._reset()
 
     def _reset(self) -> None:
@@ -125,6 +126,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def receive(self, message: Message, now: float) -> None:
         if not self._is_ours(message):
+            is_request = isinstance(message, (MissionRequestInt, MissionRequest))
+            self._is_older_upload_open |= is_request and self._is_for_us(message)
             return
         if isinstance(message, MissionAck):
             # Without progress for long, ERROR means that the vehicle's transfer has expired: our items were lost, even
@@ -137,6 +140,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         elif isinstance(message, (MissionRequestInt, MissionRequest)) and self._first <= message.seq < self._end:
             self._sends_floats = isinstance(message, MissionRequest) and not self._supports_int
             self._on_request(message.seq, now)
+        elif isinstance(message, (MissionRequestInt, MissionRequest)) and message.seq == self._end:
+            self._on_request_after_end(now)
 
     def expire(self, now: float) -> None:
         if self._is_idle(now):
@@ -183,6 +188,16 @@ class MissionUpload(MissionExchange[UploadResult]):
         while self._sent_end < min(self._end, self._confirmed_end + self._window):
             self._send(self._sent_end, now)
         self._wait(now)
+
+    def _on_request_after_end(self, now: float) -> None:
+        # While PX4 waits for the first item of an upload, it does not accept the number of items of another one
+        # (mavlink_mission.cpp, handle_mission_count). It waits so if the cancellation of an earlier upload was lost.
+        may_restart = not self.is_partial and self._restarts < MAX_RESTARTS
+        if self._vehicle_has_requested and self._sent_end == self._end and may_restart:
+            self._restarts += 1
+            self._is_older_upload_open = True
+            self._reset()
+            self._announce_items(now)
 
     def _confirm_items_before(self, seq: int, now: float) -> None:
         """Record that the vehicle has all items before ``seq``."""
@@ -304,8 +319,10 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _announce_items(self, now: float) -> None:
         target = (self.target_system, self.target_component)
-        if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
+        # The vehicle may be busy because our MISSION_ACK to a download, or our cancellation of an upload, was lost.
+        if self._busy_until is not None or self._is_older_upload_open:
             self._outbox += self.cancellation()
+            self._is_older_upload_open = False
         if self.is_partial:
             partial = MissionWritePartialList(*target, self._first, self._end - 1, self.mission_type)
             self._outbox.append(partial)

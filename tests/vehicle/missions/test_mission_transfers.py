@@ -23,6 +23,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import MavMissionResult as Result
+from aerokit.mavlink.enums import MavMissionType
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.compare import ItemStorage
@@ -296,6 +297,19 @@ async def test_late_ack_of_earlier_upload_does_not_confirm_lost_items() -> None:
         with pytest.raises(MissionRejected, match="refused the plan at about item 0; its items differ from those sent"):
             await flight.vehicle.mission.upload(other, method="items", only_changes=False, verify=False)
         assert not holds(flight, other)
+
+
+@pytest.mark.parametrize("older_count", [1, 3, 4, 5, 9, 20])
+@pytest.mark.parametrize("older_kind", [MavMissionType.MISSION, MavMissionType.FENCE])
+async def test_px4_upload_after_lost_cancellation_of_older_upload(older_count: int, older_kind: MavMissionType) -> None:
+    """PX4 waits for the first item of the older upload, and keeps its kind and number of items."""
+    async with open_px4(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(7))
+        flight.vehicle.connection.send(m.MissionCount(flight.px4.system_id, 1, older_count, older_kind))
+        plan, started_at = changed(long_mission(4), 1), now()
+        await flight.vehicle.mission.upload(plan, verify=False)
+        assert holds(flight, plan)
+        assert now() - started_at < 4.0
 
 
 async def test_too_many_items_has_the_vehicles_reasons() -> None:

@@ -312,7 +312,9 @@ class PlanTransfer(Generic[PlanT]):
             raise error
         self._cache.has_file = False
 
-    async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
+    async def _send_items(
+        self, items: Sequence[MissionItem], method: str, *, verify: bool, may_repeat: bool = True
+    ) -> None:
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
@@ -325,7 +327,12 @@ class PlanTransfer(Generic[PlanT]):
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
-            # The answers to the upload were ambiguous. The differences show that the vehicle refused the plan.
+            if may_repeat:
+                # The answers were ambiguous. PX4 answers so if it has taken the first of our items for those of an
+                # earlier, shorter upload, whose cancellation was lost. That upload has ended now.
+                await self._send_items(items, method, verify=verify, may_repeat=False)
+                return
+            # The differences show that the vehicle refused the plan.
             raise MissionRejected(
                 f"{self._name}: the vehicle refused the plan at about item {result.item};"
                 " its items differ from those sent",
