@@ -89,6 +89,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         """True once the vehicle has requested an item. From then on it may have overwritten items."""
         self.was_dropped: bool = False
         """True if the upload failed because the vehicle has dropped the transfer, e.g. in a reboot."""
+        self.was_accepted_early: bool = False
+        """True if the vehicle accepted a plan before all items were sent; see `_on_request_after_end`."""
         self._is_item_refused = False
         self._restarts = 0
         self._busy_until: float | None = None
@@ -235,8 +237,10 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._fail_as_refused(result)
 
     def _on_accepted(self, opaque_id: int, now: float) -> None:
-        # Before all items were sent, an ACCEPTED can only answer an earlier upload.
-        if self._vehicle_has_requested and self._sent_end == self._end:
+        # Before all items were sent, an ACCEPTED answers an earlier upload, which may have ended with our first items.
+        if self._vehicle_has_requested and self._sent_end < self._end:
+            self.was_accepted_early = True
+        elif self._vehicle_has_requested:
             # We may send the last item before the vehicle requests it. Until the vehicle does, an ACCEPTED may be a
             # delayed answer to an earlier upload.
             was_last_requested = self._confirmed_end == self._end - 1

@@ -312,6 +312,22 @@ async def test_px4_upload_after_lost_cancellation_of_older_upload(older_count: i
         assert now() - started_at < 4.0
 
 
+async def test_px4_silent_after_early_acceptance_may_have_first_items() -> None:
+    async with open_px4(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(7))
+        flight.vehicle.connection.send(m.MissionCount(flight.px4.system_id, 1, count=3))
+        on_item = flight.px4.handlers[m.MissionItemInt.ID]
+
+        def lose_later_items(message: m.MissionItemInt, channel: Any) -> None:
+            if message.seq < 3:
+                on_item(message, channel)
+
+        flight.px4.handlers[m.MissionItemInt.ID] = lose_later_items
+        with pytest.raises(MissionTimeout, match="may have accepted the first items as the whole plan"):
+            await flight.vehicle.mission.upload(changed(long_mission(20), 1))
+        assert len(held_by(flight)) == 3
+
+
 async def test_too_many_items_has_the_vehicles_reasons() -> None:
     async with open_flight() as flight:
         with pytest.raises(MissionRejected, match="items are supported") as caught:

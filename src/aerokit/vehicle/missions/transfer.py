@@ -189,6 +189,8 @@ class PlanChannel:
         is_partly_overwritten = overwrites_in_place and self._has_changed
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
+        if exchange.was_accepted_early and not overwrites_in_place:
+            return "; the vehicle may have accepted the first items as the whole plan: call download()"
         if is_partly_overwritten and refused_item:
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
             return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
