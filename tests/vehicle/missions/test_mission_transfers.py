@@ -328,6 +328,15 @@ async def test_px4_silent_after_early_acceptance_may_have_first_items() -> None:
         assert len(held_by(flight)) == 3
 
 
+async def test_upload_that_cannot_be_read_back_was_confirmed() -> None:
+    async with open_px4(latency_s=0.02) as flight:
+        flight.px4.handlers[m.MissionRequestList.ID] = lambda *_: None
+        with pytest.raises(MissionTimeout, match="all items were sent, and confirmed by the vehicle") as caught:
+            await flight.vehicle.mission.upload(long_mission(9))
+        assert caught.value.missing == ()
+        assert holds(flight, long_mission(9))
+
+
 async def test_too_many_items_has_the_vehicles_reasons() -> None:
     async with open_flight() as flight:
         with pytest.raises(MissionRejected, match="items are supported") as caught:

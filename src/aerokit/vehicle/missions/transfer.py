@@ -326,6 +326,13 @@ class PlanTransfer(Generic[PlanT]):
             return
         try:
             await self._verify(items, method)
+        except MissionTimeout as error:
+            # This is the time-out of the download. The caller must learn what became of the upload.
+            is_unknown = "but whether the vehicle accepted them is unknown: call download()"
+            outcome = "and confirmed by the vehicle" if result.is_confirmed else is_unknown
+            error.args = (f"{error}; all items were sent, {outcome}",)
+            error.missing = () if result.is_confirmed else tuple(range(result.item, len(items) - self._offset))
+            raise
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
