@@ -105,6 +105,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
         self._error_at: float | None = None  # time of the first ERROR since the last progress
+        self._was_forgotten = False  # True if the vehicle has rebooted since the latest announcement
         self._was_tail_repeated = False  # True if several items at the end were repeated; see `_repeat_unconfirmed`
         self._attempt = 1
 
@@ -152,6 +153,9 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._attempt += 1
         if not self._vehicle_has_requested:
             self._announce_items(now)
+        elif self._was_forgotten and now - self._progress_at >= TRANSFER_EXPIRY_S:
+            # After a reboot, PX4 does not answer items. ArduPilot refuses new uploads during the first seconds.
+            self._restart(MavMissionResult.ERROR, now)
         elif self._sent_end < self._end:
             may_send_ahead = self._window > 1  # With a window of 1, items are only sent on request.
             self._repeat_unconfirmed(now, ahead=1 if may_send_ahead else 0)
@@ -167,6 +171,9 @@ class MissionUpload(MissionExchange[UploadResult]):
         if self._vehicle_has_requested and not self.is_partial and not self.done:
             self._reset()
             self._announce_items(now)
+
+    def vehicle_rebooted(self, now: float) -> None:
+        self._was_forgotten = self._vehicle_has_requested and not self.is_partial
 
     # ------------------------------------------------------------------------------- requests
 

@@ -337,6 +337,17 @@ async def test_upload_that_cannot_be_read_back_was_confirmed() -> None:
         assert holds(flight, long_mission(9))
 
 
+@pytest.mark.parametrize("silence_s", [0.3, 5.0])
+async def test_px4_upload_continues_after_reboot(silence_s: float) -> None:
+    async with open_px4(latency_s=0.05) as flight:
+        await anyio.sleep(10)  # so that the time since boot is smaller after the reboot
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(flight.vehicle.mission.upload, long_mission(60))
+            await anyio.sleep(0.6)
+            flight.px4.reboot(silence_s)
+        assert holds(flight, long_mission(60))
+
+
 async def test_too_many_items_has_the_vehicles_reasons() -> None:
     async with open_flight() as flight:
         with pytest.raises(MissionRejected, match="items are supported") as caught:
