@@ -162,7 +162,9 @@ class Px4Model(Store):
         if not self.is_idle and not is_again:
             self.ack(Result.ERROR, sender)
             return
-        self.partner, self.expected, self.end, self.heard_at = sender, 0, message.count, now
+        if self.is_idle:  # PX4 keeps the number of items of a transfer that is announced again.
+            self.partner, self.expected, self.end = sender, 0, message.count
+        self.heard_at = now
         self.coming = []
         self.ask(now)
 

@@ -187,6 +187,16 @@ def test_mission_upload_after_unfinished_download() -> None:
     assert vehicle.stored == NEW
 
 
+@pytest.mark.parametrize("older_count", [41, 100])
+def test_mission_upload_after_px4_missed_cancellation_of_longer_one(older_count: int) -> None:
+    vehicle, exchange = Px4Model(OLD), upload(NEW)
+    vehicle.receive(m.MissionCount(1, 1, older_count), 0.0)
+    vehicle.out.clear()
+    assert run(exchange, vehicle, Radio()).seconds < 6.0
+    assert vehicle.stored == NEW
+    assert exchange.result().is_confirmed
+
+
 def test_mission_upload_restarts_after_cancellation() -> None:
     vehicle, exchange = ArduPilotModel(OLD), upload(NEW, idle_timeout_s=30.0)
     run(exchange, vehicle, Radio(silences=[(0.3, 10.0)]))

@@ -195,6 +195,19 @@ def test_upload_error_after_lost_items_restarts() -> None:
     assert acknowledge(exchange, Result.ERROR, 5.6) == ["MISSION_COUNT"]
 
 
+@pytest.mark.parametrize(("has_rebooted", "answer"), [(True, "MISSION_COUNT"), (False, 0)])
+def test_upload_restarts_after_reboot_without_progress(has_rebooted: bool, answer: int | str) -> None:
+    exchange = upload()
+    request_item(exchange, 0, 1.0)
+    sent_since(exchange)
+    if has_rebooted:
+        exchange.vehicle_rebooted(2.0)
+    exchange.expire(5.4)
+    assert sent_since(exchange) == [0]  # ArduPilot refuses new uploads so soon after its start.
+    exchange.expire(5.5)
+    assert sent_since(exchange) == [answer]
+
+
 # --------------------------------------------------------------------------------- items
 
 
@@ -214,7 +227,7 @@ def test_items_are_sent_ahead_within_window() -> None:
     assert request_item(exchange, 0, 1.0) == [0, 1, 2]
     assert request_item(exchange, 2, 1.1) == [3, 4]
     assert exchange.was_sent_completely
-    assert request_item(exchange, 5, 1.2) == []  # no such item
+    assert request_item(exchange, 6, 1.2) == []  # no such item
     assert request_item(exchange, 4, 1.2) == []
     assert acknowledge(exchange, Result.ACCEPTED, 1.2) == []
     assert exchange.result() == UploadResult(True, 0, 4)

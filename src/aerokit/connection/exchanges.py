@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from aerokit.connection.bus import copy_exception
-from aerokit.events import LinkSelected
+from aerokit.events import LinkSelected, VehicleRebooted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,6 +30,7 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
         for message_type in exchange.expects:
             attachments.callback(connection.bus.attach(message_type, run.receive, system_id=system_id))
         attachments.callback(connection.on_end(run.abort))
+        attachments.callback(connection.bus.attach_event(VehicleRebooted, partial(run.on_rebooted, system_id)))
         if connection.links is not None:
             attachments.callback(connection.bus.attach_event(LinkSelected, partial(run.on_link_selected, system_id)))
         return await run.result()
@@ -75,6 +76,11 @@ class ExchangeRun(Generic[ResultT]):
         is_first_choice = event.before is None
         if event.system_id == system_id and not is_first_choice:
             self._exchange.link_changed(self._connection.now())
+            self._send_and_reschedule()
+
+    def on_rebooted(self, system_id: int, event: VehicleRebooted) -> None:
+        if event.system_id == system_id:
+            self._exchange.vehicle_rebooted(self._connection.now())
             self._send_and_reschedule()
 
     def abort(self, error: Exception) -> None:

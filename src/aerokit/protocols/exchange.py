@@ -67,6 +67,10 @@ class Exchange(ABC, Generic[ResultT]):
         """
         return
 
+    def vehicle_rebooted(self, now: float) -> None:
+        """Called after a reboot of the vehicle, which has then forgotten the exchange. Does nothing by default."""
+        return
+
     def message_dropped(self) -> None:
         """Called if a message of `take_outbox` was certainly not sent, because no link accepted it."""
         return

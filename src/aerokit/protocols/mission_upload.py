@@ -89,9 +89,12 @@ class MissionUpload(MissionExchange[UploadResult]):
         """True once the vehicle has requested an item. From then on it may have overwritten items."""
         self.was_dropped: bool = False
         """True if the upload failed because the vehicle has dropped the transfer, e.g. in a reboot."""
+        self.was_accepted_early: bool = False
+        """True if the vehicle accepted a plan before all items were sent; see `_on_request_after_end`."""
         self._is_item_refused = False
         self._restarts = 0
         self._busy_until: float | None = None
+        self._is_older_upload_open = False  # True if the vehicle still requests items of an earlier upload
         self._reset()
 
     def _reset(self) -> None:
@@ -102,6 +105,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
         self._error_at: float | None = None  # time of the first ERROR since the last progress
+        self._was_forgotten = False  # True if the vehicle has rebooted since the latest announcement
         self._was_tail_repeated = False  # True if several items at the end were repeated; see `_repeat_unconfirmed`
         self._attempt = 1
 
@@ -125,6 +129,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def receive(self, message: Message, now: float) -> None:
         if not self._is_ours(message):
+            is_request = isinstance(message, (MissionRequestInt, MissionRequest))
+            self._is_older_upload_open |= is_request and self._is_for_us(message)
             return
         if isinstance(message, MissionAck):
             # Without progress for long, ERROR means that the vehicle's transfer has expired: our items were lost, even
@@ -137,6 +143,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         elif isinstance(message, (MissionRequestInt, MissionRequest)) and self._first <= message.seq < self._end:
             self._sends_floats = isinstance(message, MissionRequest) and not self._supports_int
             self._on_request(message.seq, now)
+        elif isinstance(message, (MissionRequestInt, MissionRequest)) and message.seq == self._end:
+            self._on_request_after_end(now)
 
     def expire(self, now: float) -> None:
         if self._is_idle(now):
@@ -145,6 +153,9 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._attempt += 1
         if not self._vehicle_has_requested:
             self._announce_items(now)
+        elif self._was_forgotten and now - self._progress_at >= TRANSFER_EXPIRY_S:
+            # After a reboot, PX4 does not answer items. ArduPilot refuses new uploads during the first seconds.
+            self._restart(MavMissionResult.ERROR, now)
         elif self._sent_end < self._end:
             may_send_ahead = self._window > 1  # With a window of 1, items are only sent on request.
             self._repeat_unconfirmed(now, ahead=1 if may_send_ahead else 0)
@@ -160,6 +171,9 @@ class MissionUpload(MissionExchange[UploadResult]):
         if self._vehicle_has_requested and not self.is_partial and not self.done:
             self._reset()
             self._announce_items(now)
+
+    def vehicle_rebooted(self, now: float) -> None:
+        self._was_forgotten = self._vehicle_has_requested and not self.is_partial
 
     # ------------------------------------------------------------------------------- requests
 
@@ -183,6 +197,16 @@ class MissionUpload(MissionExchange[UploadResult]):
         while self._sent_end < min(self._end, self._confirmed_end + self._window):
             self._send(self._sent_end, now)
         self._wait(now)
+
+    def _on_request_after_end(self, now: float) -> None:
+        # While PX4 waits for the first item of an upload, it does not accept the number of items of another one
+        # (mavlink_mission.cpp, handle_mission_count). It waits so if the cancellation of an earlier upload was lost.
+        may_restart = not self.is_partial and self._restarts < MAX_RESTARTS
+        if self._vehicle_has_requested and self._sent_end == self._end and may_restart:
+            self._restarts += 1
+            self._is_older_upload_open = True
+            self._reset()
+            self._announce_items(now)
 
     def _confirm_items_before(self, seq: int, now: float) -> None:
         """Record that the vehicle has all items before ``seq``."""
@@ -220,8 +244,10 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._fail_as_refused(result)
 
     def _on_accepted(self, opaque_id: int, now: float) -> None:
-        # Before all items were sent, an ACCEPTED can only answer an earlier upload.
-        if self._vehicle_has_requested and self._sent_end == self._end:
+        # Before all items were sent, an ACCEPTED answers an earlier upload, which may have ended with our first items.
+        if self._vehicle_has_requested and self._sent_end < self._end:
+            self.was_accepted_early = True
+        elif self._vehicle_has_requested:
             # We may send the last item before the vehicle requests it. Until the vehicle does, an ACCEPTED may be a
             # delayed answer to an earlier upload.
             was_last_requested = self._confirmed_end == self._end - 1
@@ -304,8 +330,10 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _announce_items(self, now: float) -> None:
         target = (self.target_system, self.target_component)
-        if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
+        # The vehicle may be busy because our MISSION_ACK to a download, or our cancellation of an upload, was lost.
+        if self._busy_until is not None or self._is_older_upload_open:
             self._outbox += self.cancellation()
+            self._is_older_upload_open = False
         if self.is_partial:
             partial = MissionWritePartialList(*target, self._first, self._end - 1, self.mission_type)
             self._outbox.append(partial)

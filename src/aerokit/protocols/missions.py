@@ -116,11 +116,13 @@ class MissionExchange(Transfer[ResultT]):
         return MissionAck(self.target_system, self.target_component, result, self.mission_type)
 
     def _is_ours(self, message: Message) -> bool:
+        return self._is_for_us(message) and getattr(message, "mission_type", self.mission_type) == self.mission_type
+
+    def _is_for_us(self, message: Message) -> bool:
         return (
             self._is_from_target(message)
             and getattr(message, "target_system", 0) in (0, self._own_system)
             and getattr(message, "target_component", 0) in (0, self._own_component)
-            and getattr(message, "mission_type", self.mission_type) == self.mission_type
         )
 
     def _wait(self, now: float, seconds: float | None = None) -> None:

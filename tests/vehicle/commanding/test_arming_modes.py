@@ -58,6 +58,23 @@ async def test_arm_in_unarmable_mode_raises_before_sending() -> None:
         assert not flight.wire.mode_orders()
 
 
+@pytest.mark.parametrize(("mode", "flies"), [(None, True), ("LOITER", False)])
+async def test_px4_after_interrupted_mission_flies_if_armed_in_its_mode(mode: str | None, flies: bool) -> None:
+    async with open_px4() as flight:
+        vehicle = flight.vehicle
+        await vehicle.wait_ready()
+        await vehicle.arm()
+        await vehicle.take_off(5.0)
+        far = vehicle.position.value.offset(north_m=200)
+        await vehicle.mission.upload(missions.Mission([missions.waypoint(far, altitude_relative_m=20)]))
+        await vehicle.mission.start()
+        await vehicle.return_to_launch()
+        await vehicle.mode.wait_until(lambda present: present.name == "MISSION")
+        await vehicle.arm(mode=mode)
+        await anyio.sleep(10)
+        assert flight.px4.is_landed != flies
+
+
 async def test_arm_in_flight_keeps_mode() -> None:
     async with in_the_air() as flight:
         await flight.vehicle.set_mode("LAND")

@@ -24,6 +24,7 @@ from aerokit.errors import (
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import MavFtpOpcode
 from aerokit.mavlink.enums import MavMissionResult as Result
+from aerokit.mavlink.enums import MavMissionType
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.compare import ItemStorage
@@ -366,6 +367,55 @@ async def test_late_ack_of_earlier_upload_does_not_confirm_lost_items() -> None:
         with pytest.raises(MissionRejected, match="refused the plan at about item 0; its items differ from those sent"):
             await flight.vehicle.mission.upload(other, method="items", only_changes=False, verify=False)
         assert not holds(flight, other)
+
+
+@pytest.mark.parametrize("older_count", [1, 3, 4, 5, 9, 20])
+@pytest.mark.parametrize("older_kind", [MavMissionType.MISSION, MavMissionType.FENCE])
+async def test_px4_upload_after_lost_cancellation_of_older_upload(older_count: int, older_kind: MavMissionType) -> None:
+    """PX4 waits for the first item of the older upload, and keeps its kind and number of items."""
+    async with open_px4(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(7))
+        flight.vehicle.connection.send(m.MissionCount(flight.px4.system_id, 1, older_count, older_kind))
+        plan, started_at = changed(long_mission(4), 1), now()
+        await flight.vehicle.mission.upload(plan, verify=False)
+        assert holds(flight, plan)
+        assert now() - started_at < 4.0
+
+
+async def test_px4_silent_after_early_acceptance_may_have_first_items() -> None:
+    async with open_px4(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(7))
+        flight.vehicle.connection.send(m.MissionCount(flight.px4.system_id, 1, count=3))
+        on_item = flight.px4.handlers[m.MissionItemInt.ID]
+
+        def lose_later_items(message: m.MissionItemInt, channel: Any) -> None:
+            if message.seq < 3:
+                on_item(message, channel)
+
+        flight.px4.handlers[m.MissionItemInt.ID] = lose_later_items
+        with pytest.raises(MissionTimeout, match="may have accepted the first items as the whole plan"):
+            await flight.vehicle.mission.upload(changed(long_mission(20), 1))
+        assert len(held_by(flight)) == 3
+
+
+async def test_upload_that_cannot_be_read_back_was_confirmed() -> None:
+    async with open_px4(latency_s=0.02) as flight:
+        flight.px4.handlers[m.MissionRequestList.ID] = lambda *_: None
+        with pytest.raises(MissionTimeout, match="all items were sent, and confirmed by the vehicle") as caught:
+            await flight.vehicle.mission.upload(long_mission(9))
+        assert caught.value.missing == ()
+        assert holds(flight, long_mission(9))
+
+
+@pytest.mark.parametrize("silence_s", [0.3, 5.0])
+async def test_px4_upload_continues_after_reboot(silence_s: float) -> None:
+    async with open_px4(latency_s=0.05) as flight:
+        await anyio.sleep(10)  # so that the time since boot is smaller after the reboot
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(flight.vehicle.mission.upload, long_mission(60))
+            await anyio.sleep(0.6)
+            flight.px4.reboot(silence_s)
+        assert holds(flight, long_mission(60))
 
 
 async def test_too_many_items_has_the_vehicles_reasons() -> None:

@@ -134,6 +134,9 @@ class ArmingActions(VehicleBase):
         is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
         command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
+        **PX4 takes off at once if it is armed in MISSION or TAKEOFF.** When it lands after a return that interrupted a
+        mission, it changes back to MISSION by itself. Pass ``mode="LOITER"`` to stay on the ground.
+
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
         ends with the vehicle's ``async with`` block. A vehicle that another party has armed stays armed. aerokit

@@ -206,6 +206,8 @@ class PlanChannel:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_silent and self._may_have_read_file:
             return f"; {UNKNOWN_CONTENT}"
+        if exchange.was_accepted_early and not overwrites_in_place:
+            return "; the vehicle may have accepted the first items as the whole plan: call download()"
         if is_partly_overwritten and refused_item:
             # After the upload of a file there are no later items, because ArduPilot has cleared its plan first.
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
@@ -403,7 +405,9 @@ class PlanTransfer(Generic[PlanT]):
         else:
             await self._send_items(items, method, verify=verify)
 
-    async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
+    async def _send_items(
+        self, items: Sequence[MissionItem], method: str, *, verify: bool, may_repeat: bool = True
+    ) -> None:
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
@@ -413,10 +417,22 @@ class PlanTransfer(Generic[PlanT]):
             return
         try:
             await self._verify(items, method)
+        except MissionTimeout as error:
+            # This is the time-out of the download. The caller must learn what became of the upload.
+            is_unknown = "but whether the vehicle accepted them is unknown: call download()"
+            outcome = "and confirmed by the vehicle" if result.is_confirmed else is_unknown
+            error.args = (f"{error}; all items were sent, {outcome}",)
+            error.missing = () if result.is_confirmed else tuple(range(result.item, len(items) - self._offset))
+            raise
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
-            # The answers to the upload were ambiguous. The differences show that the vehicle refused the plan.
+            if may_repeat:
+                # The answers were ambiguous. PX4 answers so if it has taken the first of our items for those of an
+                # earlier, shorter upload, whose cancellation was lost. That upload has ended now.
+                await self._send_items(items, method, verify=verify, may_repeat=False)
+                return
+            # The differences show that the vehicle refused the plan.
             raise MissionRejected(
                 f"{self._name}: the vehicle refused the plan at about item {result.item};"
                 " its items differ from those sent",
