@@ -352,7 +352,7 @@ class OnboardComponent:
                 definition file) parameters.
             FileFormatError: the definition file is damaged.
         """
-        from aerokit.onboard.parts import add_camera  # Imported here, because few components need it.
+        from aerokit.onboard.camera import add_camera  # Imported here, because few components need it.
 
         add_camera(self._services, camera)
 
@@ -367,7 +367,7 @@ class OnboardComponent:
         Raises:
             InvalidArgument: the component already has a gimbal, or a handler for a gimbal command.
         """
-        from aerokit.onboard.parts import add_gimbal  # Imported here, because few components need it.
+        from aerokit.onboard.gimbal import add_gimbal  # Imported here, because few components need it.
 
         add_gimbal(self._services, gimbal)
 

@@ -1,4 +1,4 @@
-"""Memory card, lens and view of a simulated camera."""
+"""Memory card and lens of a simulated camera, and CAMERA_IMAGE_CAPTURED."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CameraZoomType, SetFocusType, StorageStatus, StorageType, StorageUsageFlag
-from aerokit.mavlink.messages import StorageInformation
-from aerokit.sim.components.component import SimulatedComponent, pose_of
-from aerokit.sim.motion import GlobalPoint, LocalFrame, quaternion_from_euler
+from aerokit.mavlink.enums import CameraZoomType, SetFocusType
+from aerokit.sim.components.component import pose_of
+from aerokit.sim.motion import GlobalPoint, quaternion_from_euler
 from aerokit.sim.vehicle import SimulatedVehicle
 
 GREY_JPEG = base64.b85decode(
@@ -20,9 +19,6 @@ GREY_JPEG = base64.b85decode(
 """A grey image of 16 × 16 pixels."""
 
 Angles = tuple[float, float, float]
-
-_READ_MIB_S, _WRITE_MIB_S = 90.0, 45.0
-_STORAGE_ID = 1
 
 
 class MemoryCard:
@@ -46,21 +42,6 @@ class MemoryCard:
 
     def format(self) -> None:
         self.used_mib = 0.0
-
-    def information(self, camera: SimulatedComponent, number: int) -> list[StorageInformation]:
-        if number not in (0, _STORAGE_ID):
-            return []
-        is_inserted = self.is_inserted
-        return [
-            StorageInformation(
-                time_boot_ms=camera.time_boot_ms, storage_id=_STORAGE_ID, storage_count=1,
-                status=StorageStatus.READY if is_inserted else StorageStatus.EMPTY,
-                total_capacity=self.capacity_mib if is_inserted else 0.0,
-                used_capacity=self.used_mib if is_inserted else 0.0, available_capacity=self.free_mib,
-                read_speed=_READ_MIB_S, write_speed=_WRITE_MIB_S, type=StorageType.MICROSD, name="SD",
-                storage_usage=StorageUsageFlag.SET | StorageUsageFlag.PHOTO | StorageUsageFlag.VIDEO,
-            )
-        ]  # fmt: skip
 
 
 FOCAL_LENGTH_MM = 4.5
@@ -165,28 +146,3 @@ def captured_image(
         q=_UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles), image_index=index,
         capture_result=result, file_url="",
     )  # fmt: skip
-
-
-# With a pitch above this limit, the optical axis meets the ground too far away or not at all.
-_MAX_GROUND_PITCH_RAD = -math.radians(5)
-_UNKNOWN, _ACCURACY_M = math.nan, 1.0
-
-
-def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | None) -> list[m.CameraTrackingGeoStatus]:
-    """Return CAMERA_TRACKING_GEO_STATUS for the point where the optical axis meets the ground."""
-    pose = pose_of(component.vehicle)
-    if pose is None or angles is None:
-        return []
-    _, pitch, yaw = angles
-    if pitch > _MAX_GROUND_PITCH_RAD:
-        return []
-    # The ground is level, at the altitude of home.
-    distance = pose.height_m / math.tan(-pitch)
-    place = LocalFrame(pose.place).to_global(distance * math.cos(yaw), distance * math.sin(yaw), pose.height_m)
-    return [
-        m.CameraTrackingGeoStatus(
-            tracking_status=flags, lat=place.latitude_e7, lon=place.longitude_e7, alt=place.altitude_m,
-            h_acc=_ACCURACY_M, v_acc=_ACCURACY_M, vel_n=0.0, vel_e=0.0, vel_d=0.0, vel_acc=_UNKNOWN,
-            dist=math.hypot(distance, pose.height_m), hdg=_UNKNOWN, hdg_acc=_UNKNOWN,
-        )
-    ]  # fmt: skip

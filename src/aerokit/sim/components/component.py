@@ -11,11 +11,11 @@ from aerokit.mavlink.enums import MavAutopilot, MavState
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, Statustext
 from aerokit.parameters import CameraDefinition, SettingValue
-from aerokit.protocols.servers.definitions import DefinedParameterServer
 from aerokit.protocols.servers.files import FileTree
 from aerokit.protocols.servers.ftp import SessionFtpServer
 from aerokit.protocols.servers.intervals import Builder as Builder
 from aerokit.protocols.servers.intervals import MessageStreams
+from aerokit.protocols.servers.parameters import DefinedParameterServer
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
 from aerokit.sim.faults import Faults
