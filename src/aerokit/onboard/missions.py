@@ -33,7 +33,6 @@ class ComponentMissions:
     def __init__(self, host: ComponentHost, tasks: BackgroundTasks, commands: ComponentCommands) -> None:
         self._host, self._tasks, self._commands = host, tasks, commands
         self._server = MissionServer(host, self._accept_or_refuse, on_set_current=self._set_current)
-        self._server.listen()
         self._on_upload: Callable[[str, tuple[MissionItem, ...]], Any] | None = None
         self._on_current: Callable[[int], object] | None = None
         commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._do_set_current)

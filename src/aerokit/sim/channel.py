@@ -241,11 +241,7 @@ class Channel:
 
     def take_outbox(self) -> bytes:
         """Return and clear the outbox."""
-        if not self._outbox:
-            return b""
-        data = b"".join(self._outbox)
-        self._outbox.clear()
-        return data
+        return b"".join(self.take_pieces())
 
     def take_pieces(self) -> list[bytes]:
         """Return and clear the outbox, with one element for each call of `write`."""

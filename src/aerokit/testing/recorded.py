@@ -265,7 +265,7 @@ class RecordedVehicle(SimulatedVehicle):
     @property
     def has_ended(self) -> bool:
         """True if the whole recording was played and the vehicle is silent."""
-        return not self._is_on and self._next >= len(self.recording.stream)
+        return not self.is_on and self._next >= len(self.recording.stream)
 
     def boot(self) -> None:
         stream = self.recording.stream
@@ -306,7 +306,7 @@ class RecordedVehicle(SimulatedVehicle):
         if self._repeat and self.recording.duration_s > self._start_s:
             self.boot()
         else:
-            self._is_on = False
+            self.is_on = False
 
     def _on_command(self, command: ReceivedCommand) -> int | None:
         answer = self._answer_to(command)

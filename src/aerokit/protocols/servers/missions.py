@@ -118,9 +118,7 @@ class MissionServer:
         self._uploads: dict[int, ListUpload] = {}
         self._clearing: m.MissionClearAll | None = None
         """MISSION_CLEAR_ALL on which ``validate`` has not decided yet."""
-
-    def listen(self) -> None:
-        on = self._host.on
+        on = host.on
         on(m.MissionRequestList, self._on_request_list)
         on(m.MissionRequestInt, self._on_request)
         on(m.MissionRequest, self._on_request)

@@ -181,6 +181,7 @@ class SimulatedCopter(CopterHost):
     ARMING: ClassVar[type[ArduPilotArming[Any]]] = CopterArming
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = CopterFailsafes
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = CopterFence
+    SETPOINTS: ClassVar[type[Any]] = CopterSetpoints
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return the handlers of the commands that ArduCopter knows."""
@@ -197,9 +198,6 @@ class SimulatedCopter(CopterHost):
             MavCmd.DO_PAUSE_CONTINUE: self._pause_or_continue,
             MavCmd.DO_MOTOR_TEST: lambda command: self.motor_test.command(command),
         }
-
-    def listen_for_setpoints(self) -> None:
-        CopterSetpoints(self)
 
     def reset_controllers(self) -> None:
         super().reset_controllers()

@@ -344,9 +344,6 @@ class ArduPilotHost(SimulatedAutopilot):
     def available_modes(self) -> list[m.AvailableModes]:
         raise NotImplementedError
 
-    def announce_parameter(self, name: str) -> None:
-        raise NotImplementedError
-
     def send_home(self, channel: Channel | None = None) -> None:
         """Send GPS_GLOBAL_ORIGIN if the origin is set, and HOME_POSITION if home is set."""
         self.send_built(m.GpsGlobalOrigin.ID, channel)

@@ -61,10 +61,7 @@ class ArduPilotMissionServer(MissionServer):
         }
         # (message type, list type) of the warnings that were sent.
         self._warnings: set[tuple[type[Message], int]] = set()
-
-    def listen(self) -> None:
-        super().listen()
-        self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
+        vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
 
     def items(self, mission_type: int) -> list[MissionItem]:
         items = self._lists.get(mission_type)

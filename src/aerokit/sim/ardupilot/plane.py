@@ -118,6 +118,7 @@ class SimulatedPlane(PlaneHost):
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = PlaneFailsafes
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = PlaneFence
     MOTORS: ClassVar[type[ArduPilotMotors]] = PlaneEngine
+    SETPOINTS: ClassVar[type[Any]] = PlaneSetpoints
 
     fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -136,9 +137,6 @@ class SimulatedPlane(PlaneHost):
             **guided_commands(self),
             MavCmd.DO_FLIGHTTERMINATION: self._terminate,
         }
-
-    def listen_for_setpoints(self) -> None:
-        PlaneSetpoints(self)
 
     def text_for_unknown_mode(self, number: int) -> tuple[int, str]:
         if number in _LIFTING_MODES:

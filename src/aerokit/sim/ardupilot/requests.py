@@ -8,6 +8,7 @@ from typing import NamedTuple
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavDataStream as Stream
 from aerokit.mavlink.enums import MavResult
+from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.channel import Channel
@@ -173,7 +174,7 @@ class ArduPilotMessageRequests:
         previous_value, previous_change = parameters[name], self._changed_rates.get(name)
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
-            vehicle.announce_parameter(name)
+            vehicle.storage.parameters.send(name, UNKNOWN_INDEX, None)
         elif previous_change is None:
             self._changed_rates[name] = _ChangedRate(value_after_reboot=previous_value, requested=rate)
         else:

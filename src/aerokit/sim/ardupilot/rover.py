@@ -260,7 +260,7 @@ class RoverSetpoints(GuidedSetpoints):
             target = GuidedTarget(velocity=velocity, backwards=backwards, yaw=heading)
         else:
             target = GuidedTarget(velocity=velocity, backwards=backwards, yaw_rate=message.body_yaw_rate)
-        self.mode.set_target(target)
+        self.vehicle.guided.set_target(target)
 
 
 _AMPERES_AT_FULL = 16.0
@@ -307,6 +307,7 @@ class SimulatedRover(RoverHost):
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = RoverFence
     MOTORS: ClassVar[type[ArduPilotMotors]] = RoverMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
+    SETPOINTS: ClassVar[type[Any]] = RoverSetpoints
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
@@ -320,9 +321,6 @@ class SimulatedRover(RoverHost):
             sideways_m_s2=9.81 * (parameters["ATC_TURN_MAX_G"] or 0.6),
         )
         return GroundMotion(self.rng, limits, wind)
-
-    def listen_for_setpoints(self) -> None:
-        RoverSetpoints(self, self.guided)
 
     @property
     def is_standby(self) -> bool:

@@ -209,7 +209,7 @@ class SubSetpoints(GuidedSetpoints):
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
         _, _, yaw = euler_from_quaternion(*message.q)
-        self.mode.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
+        self.vehicle.guided.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
 
 
 _HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44
@@ -257,13 +257,11 @@ class SimulatedSub(SubHost):
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = SubFailsafes
     MOTORS: ClassVar[type[ArduPilotMotors]] = SubMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
+    SETPOINTS: ClassVar[type[Any]] = SubSetpoints
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
         """Create the motion model. Each unit of SIM_BUOYANCY accelerates upwards by 0.1 m/s². Wind has no effect."""
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
-
-    def listen_for_setpoints(self) -> None:
-        SubSetpoints(self, self.guided)
 
     def reset_controllers(self) -> None:
         self.display_names: cycle[str] = cycle(DISPLAY_VALUES)

@@ -301,10 +301,6 @@ _OUTPUTS = 16
 _FULL_ROLL_RATE, _FULL_PITCH_RATE = 1.5, 0.5
 
 
-def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
-    return _servo_outputs(vehicle, *(vehicle.motors.pwm,) * 4)
-
-
 def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
     wing, is_armed = plane.wing, plane.motors.is_armed
     throttle = 1000 + (round(1000 * plane.motors.throttle) if is_armed else 0)
@@ -410,7 +406,7 @@ def _without(*message_ids: int) -> Builders:
 BUILDERS_OF_KIND: dict[Kind, Builders] = {
     "copter": {
         **_without(),
-        m.ServoOutputRaw.ID: _copter_outputs,
+        m.ServoOutputRaw.ID: lambda vehicle: _servo_outputs(vehicle, *(vehicle.motors.pwm,) * 4),
         m.WinchStatus.ID: lambda vehicle: vehicle.devices.winch_status(),
     },
     "plane": {

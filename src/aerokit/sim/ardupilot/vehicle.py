@@ -13,7 +13,6 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import SigningKey
-from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import ArduPilotCamera
 from aerokit.sim.ardupilot.devices import ArduPilotDevices
@@ -72,6 +71,8 @@ class ArduPilotVehicle(ArduPilotHost):
     MOTORS: ClassVar[type[ArduPilotMotors]] = ArduPilotMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = ArduPilotJoystick
     """Receiver of MANUAL_CONTROL."""
+    SETPOINTS: ClassVar[type[Any]]
+    """Handlers of set-point messages."""
 
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
     """True if home cannot be set before the estimator has an origin."""
@@ -168,13 +169,10 @@ class ArduPilotVehicle(ArduPilotHost):
     def _listen(self) -> None:
         self.requests: ArduPilotMessageRequests = ArduPilotMessageRequests(self, stream_groups=self._stream_groups)
         self.serve_commands(self.make_commands())
-        self.listen_for_setpoints()
+        self.SETPOINTS(self)
         self.on(m.Heartbeat, self._on_heartbeat)
         self.on(m.SetMode, self._on_set_mode)
-        self.rc.listen()
-        self.external.listen()
         self.JOYSTICK(self)
-        self.missions.listen()
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         """Create the motion model."""
@@ -183,9 +181,6 @@ class ArduPilotVehicle(ArduPilotHost):
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return the handler of each MAV_CMD."""
         raise NotImplementedError
-
-    def listen_for_setpoints(self) -> None:
-        """Register the handlers of set-point messages."""
 
     def look_at(self, place: Ned | None) -> None:
         """Point the gimbal, if there is one, at a place. None returns it to its default mode."""
@@ -331,9 +326,6 @@ class ArduPilotVehicle(ArduPilotHost):
         mode = self._modes[kind.number]
         assert isinstance(mode, kind)
         return mode
-
-    def announce_parameter(self, name: str) -> None:
-        self.storage.parameters.send(name, UNKNOWN_INDEX, None)
 
     def available_modes(self) -> list[m.AvailableModes]:
         return [

@@ -168,7 +168,6 @@ class Px4Vehicle(Px4Host):
         self.log_stream: Px4LogStream = Px4LogStream(self)
         self.commands: CommandServer = self.serve_commands(self.make_commands())
         self.on(m.Ping, self._on_ping)
-        self.missions.listen()
 
     @property
     def airspeed_m_s(self) -> float:
@@ -198,7 +197,6 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()  # A reboot has created a new `failsafes`.
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 

@@ -124,9 +124,7 @@ class Px4Failsafes:
         self._failing: frozenset[str] = frozenset()  # The causes that exist at present.
         self._holds_until = -math.inf  # end of the delay in which the vehicle holds instead of returning or landing
         self._is_overridden = False  # True after the user has changed the mode during a failsafe.
-
-    def listen(self) -> None:
-        self._px4.on(m.Heartbeat, self._on_heartbeat)
+        px4.on(m.Heartbeat, self._on_heartbeat)
 
     def start(self) -> None:
         self._px4.every(_INTERVAL_S, self.check)

@@ -54,10 +54,6 @@ def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
     return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, flight_uuid=0)
 
 
-def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
-    return m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI)
-
-
 def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
     return m.MagCalReport(
         compass_id=0, cal_mask=0, cal_status=MagCalStatus.SUCCESS, autosaved=0, fitness=0.0, ofs_x=0.0, ofs_y=0.0,
@@ -110,7 +106,7 @@ IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.StorageInformation.ID: _storage_information,
     m.FlightInformation.ID: _flight_information,
     m.ProtocolVersion.ID: _protocol_version,
-    m.ComponentMetadata.ID: _component_metadata,
+    m.ComponentMetadata.ID: lambda px4: m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI),
 }
 """Functions that build messages, by message id. A function returns None if there is nothing to send."""
 
@@ -216,10 +212,6 @@ def _manual_control(px4: Px4Vehicle) -> m.ManualControl:
     return m.ManualControl(px4.system_id, x=pitch, y=roll, z=throttle, r=yaw, buttons=0)
 
 
-def _timesync(px4: Px4Vehicle) -> m.Timesync:
-    return m.Timesync(0, int(px4.uptime * 1e9))
-
-
 def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None:
     if not px4.is_armed or not px4.has_position:
         return None
@@ -250,26 +242,18 @@ def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
     )
 
 
-def _link_status(px4: Px4Vehicle) -> m.LinkNodeStatus:
-    return m.LinkNodeStatus(px4.time_boot_us, *(0,) * 10)
-
-
-def _orbit_status(px4: Px4Vehicle) -> m.OrbitExecutionStatus | None:
-    return px4.flight.orbit.status() if px4.mode == ORBIT else None
-
-
 SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
-    m.LinkNodeStatus.ID: _link_status,
+    m.LinkNodeStatus.ID: lambda px4: m.LinkNodeStatus(px4.time_boot_us, *(0,) * 10),
     m.ScaledImu.ID: _scaled_imu,
     m.ScaledPressure.ID: _scaled_pressure,
     m.RcChannels.ID: _rc_channels,
     m.ManualControl.ID: _manual_control,
     m.PositionTargetGlobalInt.ID: _position_target_global,
     m.HighresImu.ID: _highres_imu,
-    m.Timesync.ID: _timesync,
+    m.Timesync.ID: lambda px4: m.Timesync(0, int(px4.uptime * 1e9)),
     m.DistanceSensor.ID: _distance_sensor,
     m.Odometry.ID: _odometry,
     m.TimeEstimateToTarget.ID: _time_estimate,
-    m.OrbitExecutionStatus.ID: _orbit_status,
+    m.OrbitExecutionStatus.ID: lambda px4: px4.flight.orbit.status() if px4.mode == ORBIT else None,
 }
 """Functions that build messages, by message id. A function returns None if there is nothing to send."""

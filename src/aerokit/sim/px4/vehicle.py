@@ -53,8 +53,7 @@ class SimulatedPx4(Px4Vehicle):
 
     def build(self, message_id: int) -> Message | None:
         """Return the current message of this id; None if there is none."""
-        builder = BUILDERS.get(message_id)
-        return None if builder is None else builder(self)
+        return BUILDERS[message_id](self) if self.can_build(message_id) else None
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
         """Refuse an invalid position and, except in version 1.16, an unsupported frame."""
