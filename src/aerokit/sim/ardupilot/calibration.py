@@ -208,10 +208,6 @@ class Calibrations:
         self.accelerometers: AccelerometerCalibration = AccelerometerCalibration(vehicle)
         self._simple_calibration_at = -math.inf
 
-    @property
-    def is_compass_running(self) -> bool:
-        return self.compasses.is_running
-
     def reset(self) -> None:
         self.compasses.reset()
         self.accelerometers.reset()

@@ -7,6 +7,7 @@ import math
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
 from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.motion import Ned
@@ -26,8 +27,8 @@ class ArduPilotCamera:
     image_count: int
     remaining: int
 
-    def __init__(self, vehicle: ArduPilotHost) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: ArduPilotHost, gimbal: ArduPilotGimbal) -> None:
+        self._vehicle, self._gimbal = vehicle, gimbal
         self.image_count = 0  # Number of images since power-on.
         self.interval_s: float = 0.0  # Seconds between two images of a series.
         self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
@@ -177,7 +178,7 @@ class ArduPilotCamera:
             time_boot_ms=self._vehicle.time_boot_ms, vendor_name=bytes(32), model_name=bytes(32), firmware_version=0,
             focal_length=0.0, sensor_size_h=0.0, sensor_size_v=0.0, resolution_h=0, resolution_v=0, lens_id=0, flags=0,
             cam_definition_version=0, cam_definition_uri="",
-            gimbal_device_id=1 if self._vehicle.gimbal.is_fitted else 0,
+            gimbal_device_id=int(self._gimbal.is_fitted),
         )  # fmt: skip
 
     def settings(self) -> m.CameraSettings | None:

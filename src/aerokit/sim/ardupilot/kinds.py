@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-import pkgutil
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Literal
 
 from aerokit.sim.parameters import SimParameters
@@ -31,9 +31,7 @@ def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:
 
 @functools.cache
 def _read(file: str) -> str:
-    data = pkgutil.get_data(__name__, file)
-    assert data is not None
-    return data.decode()
+    return Path(__file__).with_name(file).read_text("utf-8")
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import csv
 import math
-import pkgutil
 import struct
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 from aerokit.mavlink.enums import MavCmd as Cmd
@@ -48,11 +48,10 @@ class StoredCommand(NamedTuple):
 
 
 def _read_commands() -> dict[int, StoredCommand]:
-    data = pkgutil.get_data(__name__, "mission_commands.csv")
-    assert data is not None
+    text = Path(__file__).with_name("mission_commands.csv").read_text("utf-8")
     return {
         Cmd[row["command"]]: StoredCommand(row["name"], row["parameters"], row["has_place"] == "1")
-        for row in csv.DictReader(data.decode().splitlines())
+        for row in csv.DictReader(text.splitlines())
     }
 
 

@@ -111,6 +111,7 @@ class SimulatedPlane(PlaneHost):
     FIRMWARE: ClassVar[str] = "ArduPlane"
     MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
+    BASE_FLAGS: ClassVar[int] = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
     CAPABILITIES: ClassVar[int] = 0xF36F
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
@@ -153,8 +154,7 @@ class SimulatedPlane(PlaneHost):
     @property
     def base_mode(self) -> int:
         flags = int(self.mode.flags) if isinstance(self.mode, PlaneModeBase) else 0
-        armed = MavModeFlag.SAFETY_ARMED if self.motors.is_armed else 0
-        return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
+        return super().base_mode | flags
 
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds. A plane that rests for a while counts as landed."""

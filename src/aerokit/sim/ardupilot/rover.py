@@ -280,7 +280,6 @@ class RoverMotors(ArduPilotMotors):
             self.throttle = 0.0
 
 
-_GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
 _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
 
 
@@ -299,6 +298,8 @@ class SimulatedRover(RoverHost):
     MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     REPORTS_HOME: ClassVar[bool] = True
+    BASE_FLAGS: ClassVar[int] = MavModeFlag.CUSTOM_MODE_ENABLED
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
     CAPABILITIES: ClassVar[int] = 0xF1EF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = ROVER_MODES
@@ -332,14 +333,8 @@ class SimulatedRover(RoverHost):
 
     @property
     def base_mode(self) -> int:
-        flags, mode_name = int(MavModeFlag.CUSTOM_MODE_ENABLED), self.mode.name
-        if mode_name in _MANUAL_INPUT:
-            flags |= MavModeFlag.MANUAL_INPUT_ENABLED
-        if mode_name in _GUIDED_MODES:
-            flags |= MavModeFlag.GUIDED_ENABLED
-        if self.motors.is_armed:
-            flags |= MavModeFlag.SAFETY_ARMED
-        return flags
+        manual_input = MavModeFlag.MANUAL_INPUT_ENABLED if self.mode.name in _MANUAL_INPUT else 0
+        return super().base_mode | manual_input
 
     @property
     def is_at_rest(self) -> bool:

@@ -232,7 +232,6 @@ class SubMotors(ArduPilotMotors):
         self.throttle: float = max(0.0, min(1.0, throttle)) if self.is_armed else 0.0
 
 
-_GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
 _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED
 
 
@@ -250,6 +249,8 @@ class SimulatedSub(SubHost):
     KIND: ClassVar[Kind] = "sub"
     FIRMWARE: ClassVar[str] = "ArduSub"
     MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
+    BASE_FLAGS: ClassVar[int] = int(_BASE)
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
     CAPABILITIES: ClassVar[int] = 0xF9E7
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = SUB_MODES
@@ -279,15 +280,6 @@ class SimulatedSub(SubHost):
     @property
     def guided(self) -> SubGuided:
         return self.mode_of(SubGuided)
-
-    @property
-    def base_mode(self) -> int:
-        flags = int(_BASE)
-        if self.mode.name in _GUIDED_MODES:
-            flags |= MavModeFlag.GUIDED_ENABLED
-        if self.motors.is_armed:
-            flags |= MavModeFlag.SAFETY_ARMED
-        return flags
 
     @property
     def is_at_rest(self) -> bool:

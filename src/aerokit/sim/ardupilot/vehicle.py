@@ -61,6 +61,10 @@ class ArduPilotVehicle(ArduPilotHost):
     """
 
     MAV_TYPE: ClassVar[int]
+    BASE_FLAGS: ClassVar[int]
+    """MAV_MODE_FLAGs of the heartbeat in every mode."""
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset()
+    """Names of the modes in which the heartbeat has the flag GUIDED_ENABLED."""
     BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]]
     """Functions that build messages, by message id. A function returns None if there is nothing to send."""
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]]
@@ -145,21 +149,23 @@ class ArduPilotVehicle(ArduPilotHost):
         self.has_left_boot: bool = False
         self.is_landed: bool = self.motion.is_on_ground
         self.motors: ArduPilotMotors = self.MOTORS(self)
-        self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.frame)
-        self.arming: ArduPilotArming[Any] = self.ARMING(self)
-        self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
-        self.devices: ArduPilotDevices = ArduPilotDevices(self)
+        self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.external)
         self.failsafes: ArduPilotFailsafes[Any] = self.FAILSAFES(self)
+        self.arming: ArduPilotArming[Any] = self.ARMING(self, self.failsafes, self.calibrations.compasses)
+        self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
+        self.devices: ArduPilotDevices = ArduPilotDevices(self, self.arming)
         self.fence: ArduPilotFence[Any] = self.FENCE(self)
         self.gimbal: ArduPilotGimbal = ArduPilotGimbal(self)
-        self.camera: ArduPilotCamera = ArduPilotCamera(self)
+        self.camera: ArduPilotCamera = ArduPilotCamera(self, self.gimbal)
         self.calibrations.reset()
         self.external.reset()
         self.rc.release_overrides()
         modes = [make_mode(self) for make_mode in self.MODES]
         self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in modes}
         self.reset_controllers()
-        self.mission: MissionRun = MissionRun(self, self.auto)  # executes the mission that `missions` stores
+        self.mission: MissionRun = MissionRun(
+            self, self.auto, self.camera
+        )  # executes the mission that `missions` stores
         self.missions.reset()
         self.mode: ArduPilotMode = self._modes[self.first_mode]
 
@@ -214,7 +220,9 @@ class ArduPilotVehicle(ArduPilotHost):
     @property
     def base_mode(self) -> int:
         """MAV_MODE_FLAGs of the heartbeat."""
-        raise NotImplementedError
+        guided = MavModeFlag.GUIDED_ENABLED.value if self.mode.name in self.GUIDED_MODES else 0
+        armed = MavModeFlag.SAFETY_ARMED.value if self.is_armed else 0
+        return self.BASE_FLAGS | guided | armed
 
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds, and report a touchdown."""

@@ -149,8 +149,8 @@ class Px4Vehicle(Px4Host):
         self._has_flown = False  # True after a take-off, until the vehicle is armed again
         self.flight: Px4Flight = self._make_flight()
         self.mission: Px4Mission = self._make_mission()
-        self.failsafes: Px4Failsafes = Px4Failsafes(self)
         self.text_links: Px4TextLinks = Px4TextLinks(self)
+        self.failsafes: Px4Failsafes = Px4Failsafes(self, self.text_links)
         self.missions.reset()
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:

@@ -17,7 +17,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.missions import FenceZones
 from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
+from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH, Px4TextLinks
 from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, MODES, OFFBOARD, ORBIT, RTL, Px4Mode
 
 _NO_ACTION, _WARNING = 0, 1
@@ -106,8 +106,8 @@ class Px4Failsafes:
 
     battery_state: MavBatteryChargeState
 
-    def __init__(self, px4: Px4Host) -> None:
-        self._px4 = px4
+    def __init__(self, px4: Px4Host, text_links: Px4TextLinks) -> None:
+        self._px4, self._text_links = px4, text_links
         self.fence: Px4Fence = Px4Fence(px4)
         self.action: FailsafeAction = Action.NONE  # The action that is being executed.
         self.battery_state = MavBatteryChargeState.OK
@@ -136,7 +136,7 @@ class Px4Failsafes:
     def _on_heartbeat(self, beat: m.Heartbeat, channel: Channel) -> None:
         if beat.type != MavType.GCS:
             return
-        self._px4.text_links.on_station_heartbeat(channel)
+        self._text_links.on_station_heartbeat(channel)
         if not self.has_station and math.isfinite(self._station_at):
             self._px4.info("GCS connection regained")
         self.has_station = True

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import math
-import pkgutil
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame as Frame
@@ -17,9 +17,7 @@ from aerokit.protocols.servers.missions import ItemRefused
 from aerokit.sim.commands import to_int
 from aerokit.sim.missions import POLYGON_CORNERS, float32
 
-_DATA = pkgutil.get_data(__name__, "mission_commands.csv")
-assert _DATA is not None
-_ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
+_ROWS = list(csv.DictReader(Path(__file__).with_name("mission_commands.csv").read_text("utf-8").splitlines()))
 # Storage types (see `_CONVERSIONS`) of params 1 to 4 of each command that is allowed in a global frame.
 _COMMANDS_WITH_PLACE = {int(Cmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
 # Commands that are allowed in MAV_FRAME_MISSION. All their seven params are stored.

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import pkgutil
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from aerokit.errors import RemoteProtocolError
@@ -28,9 +28,7 @@ from aerokit.sim.px4.host import Px4Host
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
     """Return the parameters of a "quadrotor" or an "airplane". ``count`` limits how many are listed."""
-    data = pkgutil.get_data(__name__, f"{table}.param.csv")
-    assert data is not None
-    return SimParameters.from_text(data.decode(), count)
+    return SimParameters.from_text(Path(__file__).with_name(f"{table}.param.csv").read_text("utf-8"), count)
 
 
 class Px4ParameterMount(ParameterPackMount):
