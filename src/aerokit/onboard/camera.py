@@ -220,13 +220,10 @@ class CameraAdapter(CameraDevice):
         self.sensor_mm: tuple[float, float] = camera.sensor_mm
         self.streams: tuple[str, ...] = camera.streams
         self.capabilities: int = capabilities_of(camera)
+        self.host: ServerHost = host
         self._camera, self._host, self._tasks, self._call = camera, host, tasks, call
         self.set_up_captures()
         self.running_streams: set[int] = set(range(1, len(self.streams) + 1))
-
-    @property
-    def host(self) -> ServerHost:
-        return self._host
 
     @property
     def zoom(self) -> float:
@@ -383,12 +380,13 @@ DEFINITION_PATH = "/camera_definition.xml"
 class DefinedSettings(DefinedParameterServer):
     """Settings of a `CameraDriver` with a definition file."""
 
+    _host: ComponentHost  # pyright: ignore[reportIncompatibleVariableOverride]
+
     def __init__(
         self, host: ComponentHost, definition: CameraDefinition, on_change: Callable[[str, SettingValue], Any]
     ):
         self._on_change = on_change
         super().__init__(host, definition)
-        self._component = host
 
     def set(self, name: str, data: bytes, kind: int) -> int:
         old_value = self.values[name]
@@ -396,7 +394,7 @@ class DefinedSettings(DefinedParameterServer):
             return super().set(name, data, kind)
         except Exception as error:  # The program's function has refused the new value.
             self.values[name] = old_value
-            self._component.report_error(name, error)
+            self._host.report_error(name, error)
             return ParamAck.FAILED
 
     def on_set(self, name: str, value: SettingValue) -> None:

@@ -127,17 +127,11 @@ class GimbalAdapter(GimbalMount):
                 self.capabilities &= ~axis_flags
         if yaw == _FULL_TURN_DEG:
             self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
-        self._gimbal, self._host, self._stop_functions = gimbal, services.host, services.stop_functions
+        self.host: ServerHost = services.host
+        self.device_id: int = services.host.component_id
+        self._gimbal, self._stop_functions = gimbal, services.stop_functions
         self._is_yaw_locked = False
         self._followed_system_id = 0  # system at which the gimbal points; 0 if there is none
-
-    @property
-    def host(self) -> ServerHost:
-        return self._host
-
-    @property
-    def device_id(self) -> int:
-        return self._host.component_id
 
     @property
     def is_yaw_locked(self) -> bool:

@@ -49,6 +49,10 @@ class GimbalMount:
     Angles are in radians: roll and pitch from the horizon, yaw from the vehicle's nose or, if locked, from north.
     """
 
+    host: ServerHost
+    """The component that serves the gimbal."""
+    device_id: int
+    """Component id of the gimbal, which commands use to select it."""
     vendor: str = "aerokit"
     model: str = "gimbal"
     capabilities: int = ALL_CAPABILITIES
@@ -63,16 +67,6 @@ class GimbalMount:
     """The component in secondary control; zeros if none."""
     flags: int = 0
     """GIMBAL_MANAGER_FLAGS of the latest command."""
-
-    @property
-    def host(self) -> ServerHost:
-        """The component that serves the gimbal."""
-        raise NotImplementedError
-
-    @property
-    def device_id(self) -> int:
-        """Component id of the gimbal, which commands use to select it."""
-        raise NotImplementedError
 
     @property
     def is_yaw_locked(self) -> bool:

@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import MavDoRepositionFlags, MavFrame, MavMountMode, 
 from aerokit.mavlink.enums import MavResult as Result
 from aerokit.protocols.servers.gimbal import Angles, angles_and_rates
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
+from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
@@ -233,14 +234,6 @@ class _CommonCommands:
         return Result.ACCEPTED
 
 
-_FRAMES = frozenset(
-    {
-        MavFrame.GLOBAL, MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT,
-        MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT,
-    }
-)  # fmt: skip
-
-
 class HomeAndOrigin:
     """Handlers of DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
 
@@ -265,7 +258,7 @@ class HomeAndOrigin:
             return Result.FAILED
         # COMMAND_LONG has no frame. The firmware takes the altitude as AMSL.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
-        if frame not in _FRAMES:
+        if frame not in RELATIVE_FRAMES | TERRAIN_FRAMES | ABSOLUTE_FRAMES:
             vehicle.info(f"Unknown mavlink coordinate frame {frame}")
             return Result.DENIED
         point = vehicle.world_point(*command.place(), command.z, frame)

@@ -253,9 +253,9 @@ class ArduPilotFenceHost(Protocol):
     def reason_not_to_arm(self) -> str | None: ...
 
 
-_RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
-_TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
-_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
+RELATIVE_FRAMES = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
+TERRAIN_FRAMES = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
+ABSOLUTE_FRAMES = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class ArduPilotHost(SimulatedAutopilot):
@@ -339,12 +339,12 @@ class ArduPilotHost(SimulatedAutopilot):
         if not is_place or not math.isfinite(altitude):
             return None
         north, east = self.frame.to_local(latitude_e7, longitude_e7)
-        if frame in _RELATIVE:
+        if frame in RELATIVE_FRAMES:
             _, _, home_down = self.home_or_ground
             return (north, east, home_down - altitude)
-        if frame in _TERRAIN:
+        if frame in TERRAIN_FRAMES:
             return (north, east, self.motion.ground_down - altitude)
-        if frame in _ABSOLUTE:
+        if frame in ABSOLUTE_FRAMES:
             return (north, east, self.frame.origin.altitude_m - altitude)
         self.info(f"Unknown mavlink coordinate frame {frame}")
         return None

@@ -22,7 +22,7 @@ _FIRST = 1
 _MAX_JUMPS, _MAX_STEPS, _MAX_LOOK_AHEAD = 64, 255, 16
 _UNLIMITED = -1
 _WITH_TARGET = frozenset({Cmd.DO_JUMP, Cmd.JUMP_TAG, Cmd.DO_JUMP_TAG})
-_TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
+TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
 _BEFORE_TAKE_OFF = frozenset({Cmd.DO_AUX_FUNCTION, Cmd.NAV_DELAY})
 # Navigation commands with a number above NAV_LAST.
 _NAVIGATION_ABOVE_LAST = frozenset({Cmd.NAV_SET_YAW_SPEED, Cmd.NAV_SCRIPT_TIME, Cmd.NAV_ATTITUDE_TIME})
@@ -163,7 +163,7 @@ class MissionRun:
         """Return True if the first navigation command from ``index`` on is a take-off. Delays are skipped."""
         for _, item in self.navigation_from(index):
             if item.command not in _BEFORE_TAKE_OFF:
-                return item.command in _TAKE_OFFS
+                return item.command in TAKE_OFFS
         return False
 
     def navigation_from(self, index: int) -> Iterator[MissionCommand]:

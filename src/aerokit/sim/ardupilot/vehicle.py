@@ -27,11 +27,11 @@ from aerokit.sim.ardupilot.mission_server import ArduPilotMissionServer
 from aerokit.sim.ardupilot.navigation import ArduPilotNavigation
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio, AuxiliaryOutputs
 from aerokit.sim.ardupilot.requests import ArduPilotMessageRequests
-from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, ArduPilotStorage
+from aerokit.sim.ardupilot.storage import ArduPilotSigning, ArduPilotStorage
 from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler
-from aerokit.sim.logs import SimulatedLog
+from aerokit.sim.logs import DEFAULT_LOGS, SimulatedLog
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import AttachableComponent, sender_of

@@ -188,6 +188,7 @@ class SimulatedCamera(SimulatedComponent, CameraDevice):
         picture: bytes | Callable[[CameraImageCaptured], bytes] = GREY_JPEG,
     ) -> None:
         super().__init__(component_id, system_id=system_id)
+        self.host: ServerHost = self
         self.vendor: str = vendor
         self.model: str = model
         content = own_definition() if definition is None else definition
@@ -218,10 +219,6 @@ class SimulatedCamera(SimulatedComponent, CameraDevice):
         self.source: int = CameraSource.DEFAULT
         """CAMERA_SOURCE of the displayed sensor."""
         self.lens: Lens = Lens(lambda: self.now)
-
-    @property
-    def host(self) -> ServerHost:
-        return self
 
     @property
     def free_mib(self) -> float:

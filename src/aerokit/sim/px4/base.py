@@ -16,7 +16,7 @@ from aerokit.mavlink.signing import SigningKey
 from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
-from aerokit.sim.logs import SimulatedLog
+from aerokit.sim.logs import DEFAULT_LOGS, SimulatedLog
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
@@ -33,7 +33,7 @@ from aerokit.sim.px4.mission_server import Px4MissionServer
 from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.offboard import Px4Offboard
 from aerokit.sim.px4.payload import Px4CameraTrigger, Px4Gimbal
-from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Px4Storage, px4_parameters
+from aerokit.sim.px4.storage import Px4Signing, Px4Storage, px4_parameters
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
 # Shares of the boot time after which the streams start, and pre-arm warnings are sent.
