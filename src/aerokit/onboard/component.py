@@ -306,8 +306,7 @@ class OnboardComponent:
         The component serves them from the first access to this property on.
         """
         if self._missions is None:
-            self._missions = ComponentMissions(self._host, self._tasks, self._commands)
-            self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current
+            self._missions = ComponentMissions(self._services)
             self._identity.capabilities |= Capability.MISSION_INT | Capability.MISSION_FENCE | Capability.MISSION_RALLY
         return self._missions
 

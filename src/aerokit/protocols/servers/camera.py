@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -328,20 +328,18 @@ class _Settings:
         return self._send_settings()
 
     async def set_zoom(self, command: ReceivedCommand) -> int:
-        camera = self._camera
-        if not camera.can(CameraCapFlags.HAS_BASIC_ZOOM):
-            return MavResult.UNSUPPORTED
-        if not await camera.set_zoom(to_int(command.param1), command.param2):
-            return MavResult.DENIED
-        return self._send_settings()
+        return await self._adjust(CameraCapFlags.HAS_BASIC_ZOOM, self._camera.set_zoom, command)
 
     async def set_focus(self, command: ReceivedCommand) -> int:
-        camera = self._camera
-        if not camera.can(CameraCapFlags.HAS_BASIC_FOCUS):
+        return await self._adjust(CameraCapFlags.HAS_BASIC_FOCUS, self._camera.set_focus, command)
+
+    async def _adjust(
+        self, needed_capability: int, adjust: Callable[[int, float], Awaitable[bool]], command: ReceivedCommand
+    ) -> int:
+        if not self._camera.can(needed_capability):
             return MavResult.UNSUPPORTED
-        if not await camera.set_focus(to_int(command.param1), command.param2):
-            return MavResult.DENIED
-        return self._send_settings()
+        is_supported = await adjust(to_int(command.param1), command.param2)
+        return self._send_settings() if is_supported else MavResult.DENIED
 
     async def set_source(self, command: ReceivedCommand) -> int:
         source = to_int(command.param2)

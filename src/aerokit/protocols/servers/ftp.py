@@ -209,9 +209,6 @@ class SessionFtpServer(Generic[FilesT]):
     def _unknown(self, request: FtpPacket) -> FtpPacket:
         return request.refuse(MavFtpErr.UNKNOWNCOMMAND)
 
-    def _none(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
-        return request.acknowledge(request.data[: request.size])
-
     def _terminate(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         session = self._session_of(client, request)
         del client.sessions[request.session]
@@ -411,7 +408,7 @@ def _line(entry: Entry) -> bytes:
 
 
 _HANDLERS: dict[int, Callable[[SessionFtpServer[Any], ServedClient, FtpPacket], FtpPacket | None]] = {
-    Op.NONE: lambda server, client, request: server._none(client, request),
+    Op.NONE: lambda _server, _client, request: request.acknowledge(request.data[: request.size]),
     Op.TERMINATESESSION: lambda server, client, request: server._terminate(client, request),
     Op.RESETSESSION: lambda server, client, request: server._reset(client, request),
     Op.LISTDIRECTORY: lambda server, client, request: server._list(client, request),

@@ -246,7 +246,7 @@ class CopterPilotedMode(CopterModeBase):
             copter.is_landed = False
         if copter.is_landed:
             return
-        roll, pitch, yaw = ((copter.rc[channel] - _MID_STICK) / _STICK_RANGE for channel in (RC_ROLL, RC_PITCH, RC_YAW))
+        roll, pitch, yaw = map(copter.stick, (RC_ROLL, RC_PITCH, RC_YAW))
         self.fly(roll, pitch, climb)
         copter.motion.turn(yaw * _FULL_STICK_TURN_RAD_S)
 

@@ -139,9 +139,6 @@ class GuidedSetpoints:
             self.vehicle.guided.set_target(target)
 
 
-_STICK_MIDDLE, _STICK_RANGE = 1500.0, 500.0
-
-
 class RoverSubVehicle(ArduPilotVehicle):
     """Base of Rover and Sub. Takes the arguments of `ArduPilotVehicle`."""
 
@@ -165,10 +162,6 @@ class RoverSubVehicle(ArduPilotVehicle):
     @is_landed.setter
     def is_landed(self, _: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Ignore the assigned value, because these vehicles do not take off."""
-
-    def stick(self, index: int) -> float:
-        """Return a stick position, -1 to 1."""
-        return (self.rc[index] - _STICK_MIDDLE) / _STICK_RANGE
 
     def tick(self, dt: float) -> None:
         if self.motors.is_armed:

@@ -36,8 +36,8 @@ from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, Ned, Simul
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
-_REBOOT_SILENCE_S = 1.5
 _TIMESYNC_INTERVAL_S = 10.0
+_STICK_MIDDLE, _STICK_RANGE = 1500, 500
 _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
 ModeT = TypeVar("ModeT", bound="ArduPilotMode")
 
@@ -224,6 +224,10 @@ class ArduPilotVehicle(ArduPilotHost):
         armed = MavModeFlag.SAFETY_ARMED.value if self.is_armed else 0
         return self.BASE_FLAGS | guided | armed
 
+    def stick(self, index: int) -> float:
+        """Return the position of a stick from -1 to 1."""
+        return (self.rc[index] - _STICK_MIDDLE) / _STICK_RANGE
+
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds, and report a touchdown."""
         motion = self.motion
@@ -271,10 +275,6 @@ class ArduPilotVehicle(ArduPilotHost):
         channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, heartbeat_at))
         channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_INTERVAL_S, max(self.now, timesync_at))
         self.requests.start_channel(channel, max(self.now, ready_at))
-
-    def restart(self) -> None:
-        """Reboot, with the silence of the real firmware."""
-        self.reboot(_REBOOT_SILENCE_S)
 
     def reboot(self, silence_s: float) -> None:
         """See `SimulatedVehicle.reboot`. Resets estimates and the autopilot's own devices, such as its gimbal."""

@@ -111,7 +111,7 @@ def _format(camera: SimulatedCamera, command: ReceivedCommand) -> int | CommandP
 
     def finish() -> None:
         if formats_card:
-            camera.card.format()
+            camera.card.used_mib = 0.0
             camera.files.clear_folder("/DCIM")
         if resets_image_log:
             captures.clear()

@@ -40,9 +40,6 @@ class MemoryCard:
         self.used_mib += size_mib
         return True
 
-    def format(self) -> None:
-        self.used_mib = 0.0
-
 
 FOCAL_LENGTH_MM = 4.5
 """Focal length without zoom."""
@@ -76,9 +73,17 @@ class Axis:
         self._start_at = self._now()
         self._speed = max(-1.0, min(1.0, speed)) * _MAX_SPEED_PERCENT_S
 
-    def step(self, steps: float) -> None:
-        """Change the setting by ``steps`` tenths of its range."""
-        self.set(self.percent + steps * _STEP_PERCENT)
+    def adjust(self, kind: int, value: float) -> bool:
+        """Apply a CAMERA_ZOOM_TYPE, or the SET_FOCUS_TYPE with the same number. Return False for other numbers."""
+        if kind == CameraZoomType.STEP:  # The value is in tenths of the range.
+            self.set(self.percent + value * _STEP_PERCENT)
+        elif kind == CameraZoomType.CONTINUOUS:
+            self.move(value)
+        elif kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
+            self.set(value)
+        else:
+            return False
+        return True
 
 
 class Lens:
@@ -94,33 +99,20 @@ class Lens:
 
     def set_zoom(self, kind: int, value: float) -> bool:
         """Apply SET_CAMERA_ZOOM. Return False if the type or the value is not supported."""
-        if kind == CameraZoomType.STEP:
-            self.zoom.step(value)
-        elif kind == CameraZoomType.CONTINUOUS:
-            self.zoom.move(value)
-        elif kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
-            self.zoom.set(value)
-        elif kind == CameraZoomType.FOCAL_LENGTH and 1.0 <= value / FOCAL_LENGTH_MM <= _ZOOM_FACTOR:
-            zoom_factor = value / FOCAL_LENGTH_MM
-            self.zoom.set((zoom_factor - 1.0) / (_ZOOM_FACTOR - 1.0) * 100.0)
-        else:
-            return False
+        zoom_factor = value / FOCAL_LENGTH_MM
+        if kind != CameraZoomType.FOCAL_LENGTH or not 1.0 <= zoom_factor <= _ZOOM_FACTOR:
+            return self.zoom.adjust(kind, value)
+        self.zoom.set((zoom_factor - 1.0) / (_ZOOM_FACTOR - 1.0) * 100.0)
         return True
 
     def set_focus(self, kind: int, value: float) -> bool:
         """Apply SET_CAMERA_FOCUS. Return False if the type or the value is not supported."""
-        if kind == SetFocusType.STEP:
-            self.focus.step(value)
-        elif kind == SetFocusType.CONTINUOUS:
-            self.focus.move(value)
-        elif kind == SetFocusType.RANGE and 0.0 <= value <= 100.0:
-            self.focus.set(value)
-        elif kind == SetFocusType.METERS and value > 0.0:
+        if kind == SetFocusType.METERS and value > 0.0:
             self.focus.set(100.0 * value / (value + _HALF_RANGE_FOCUS_M))  # 100 % is infinity.
         elif kind in _AUTO:
             self.focus.set(_SHARP_PERCENT)
         else:
-            return False
+            return self.focus.adjust(kind, value)
         return True
 
 

@@ -38,7 +38,6 @@ from aerokit.sim.vehicle import AttachableComponent, sender_of
 
 # Shares of the boot time after which the streams start, and pre-arm warnings are sent.
 _HEARTBEAT_BOOT_SHARE, _WARNING_BOOT_SHARE = 0.2, 0.3
-_REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
 _AMPERES_AT_FULL = 40.0
@@ -215,9 +214,6 @@ class Px4Vehicle(Px4Host):
         ready_at = max(self.now, self.booted_at + self._boot_time_s)
         # PX4 does not stream the origin, but sends it once, and again after a change.
         self.call_at(ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel))
-
-    def restart(self) -> None:
-        self.reboot(_REBOOT_SILENCE_S)
 
     def reboot(self, silence_s: float) -> None:
         self.motion.down = self.motion.ground_down

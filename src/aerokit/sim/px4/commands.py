@@ -110,9 +110,12 @@ _BEFORE_INT32_MAX, _AFTER_INT32_MAX = 2.0**31 - 128, 2.0**31 + 256
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    flight = _FlightCommands(px4)
+    flight, requests = _FlightCommands(px4), _MessageRequests(px4)
     return {
-        **message_requests(px4),
+        Cmd.REQUEST_MESSAGE: requests.request_message,
+        Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
+        Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
+        **{command: partial(requests.send_now, message) for command, message in _LEGACY_REQUESTS.items()},
         **other_commands(px4),
         **px4.camera_trigger.commands(),
         **gimbal_commands(px4.gimbal),
@@ -362,18 +365,6 @@ class _FlightCommands:
 
 _NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID, m.CurrentEventSequence.ID})
 _ACKNOWLEDGED_ONLY = frozenset({m.Heartbeat.ID})
-
-
-def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    requests = _MessageRequests(px4)
-    handlers: dict[int, CommandHandler] = {
-        Cmd.REQUEST_MESSAGE: requests.request_message,
-        Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
-        Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
-    }
-    for command, message_id in _LEGACY_REQUESTS.items():
-        handlers[command] = partial(requests.send_now, message_id)
-    return handlers
 
 
 # The message that each of these older commands requests.

@@ -269,10 +269,6 @@ def _vibration(px4: Px4Vehicle) -> m.Vibration:
     return m.Vibration(px4.time_boot_us, 0.0, 0.1, vibration_z, clipping_0=0, clipping_1=0, clipping_2=0)
 
 
-def _current_mode(px4: Px4Vehicle) -> m.CurrentMode:
-    return m.CurrentMode(_STANDARD.get(px4.mode, 0), modes.custom_mode(px4.mode), modes.custom_mode(px4.intended_mode))
-
-
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
     count = len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
@@ -319,7 +315,9 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.MissionCurrent.ID: _mission_current,
     m.Vibration.ID: _vibration,
     m.SystemTime.ID: lambda px4: m.SystemTime(round(px4.unix_time * 1e6), px4.time_boot_ms),
-    m.CurrentMode.ID: _current_mode,
+    m.CurrentMode.ID: lambda px4: m.CurrentMode(
+        _STANDARD.get(px4.mode, 0), modes.custom_mode(px4.mode), modes.custom_mode(px4.intended_mode)
+    ),
     m.Ping.ID: lambda px4: m.Ping(px4.time_boot_us, px4.next_ping(), target_system=0, target_component=0),
     m.CurrentEventSequence.ID: lambda px4: px4.events.current(),
     **SENSOR_BUILDERS,

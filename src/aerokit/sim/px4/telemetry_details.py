@@ -34,32 +34,11 @@ def _autopilot_version(px4: Px4Vehicle) -> m.AutopilotVersion:
     )  # fmt: skip
 
 
-def _protocol_version(_: Px4Vehicle) -> m.ProtocolVersion:
-    return m.ProtocolVersion(
-        version=200, min_version=100, max_version=203, spec_version_hash=bytes(8), library_version_hash=_LIBRARY_HASH
-    )
-
-
-def _storage_information(px4: Px4Vehicle) -> m.StorageInformation:
-    return m.StorageInformation(
-        px4.time_boot_ms, storage_id=1, storage_count=1, status=StorageStatus.READY, total_capacity=_CAPACITY_MIB,
-        used_capacity=_USED_MIB, available_capacity=_CAPACITY_MIB - _USED_MIB, read_speed=0.0, write_speed=0.0,
-    )  # fmt: skip
-
-
 def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
     armed_for = px4.now - px4.arming.armed_at
     armed_at_us = int((px4.unix_time - armed_for) * 1e6) if px4.is_armed else 0
     take_off_us = 0 if px4.is_landed else armed_at_us
     return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, flight_uuid=0)
-
-
-def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
-    return m.MagCalReport(
-        compass_id=0, cal_mask=0, cal_status=MagCalStatus.SUCCESS, autosaved=0, fitness=0.0, ofs_x=0.0, ofs_y=0.0,
-        ofs_z=0.0, diag_x=1.0, diag_y=1.0, diag_z=1.0, offdiag_x=0.0, offdiag_y=0.0, offdiag_z=0.0,
-        orientation_confidence=1.0, old_orientation=0, new_orientation=0, scale_factor=1.0,
-    )  # fmt: skip
 
 
 _REMOTE_ID_EPOCH = 1_546_300_800
@@ -102,12 +81,21 @@ IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.OpenDroneIdLocation.ID: _remote_location,
     m.OpenDroneIdSystem.ID: _remote_system,
     m.AutopilotVersion.ID: _autopilot_version,
-    m.MagCalReport.ID: _mag_cal_report,
-    m.StorageInformation.ID: _storage_information,
+    m.MagCalReport.ID: lambda _: m.MagCalReport(
+        compass_id=0, cal_mask=0, cal_status=MagCalStatus.SUCCESS, autosaved=0, fitness=0.0, ofs_x=0.0, ofs_y=0.0,
+        ofs_z=0.0, diag_x=1.0, diag_y=1.0, diag_z=1.0, offdiag_x=0.0, offdiag_y=0.0, offdiag_z=0.0,
+        orientation_confidence=1.0, old_orientation=0, new_orientation=0, scale_factor=1.0,
+    ),
+    m.StorageInformation.ID: lambda px4: m.StorageInformation(
+        px4.time_boot_ms, storage_id=1, storage_count=1, status=StorageStatus.READY, total_capacity=_CAPACITY_MIB,
+        used_capacity=_USED_MIB, available_capacity=_CAPACITY_MIB - _USED_MIB, read_speed=0.0, write_speed=0.0,
+    ),
     m.FlightInformation.ID: _flight_information,
-    m.ProtocolVersion.ID: _protocol_version,
+    m.ProtocolVersion.ID: lambda _: m.ProtocolVersion(
+        version=200, min_version=100, max_version=203, spec_version_hash=bytes(8), library_version_hash=_LIBRARY_HASH
+    ),
     m.ComponentMetadata.ID: lambda px4: m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI),
-}
+}  # fmt: skip
 """Functions that build messages, by message id. A function returns None if there is nothing to send."""
 
 
