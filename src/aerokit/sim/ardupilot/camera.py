@@ -46,13 +46,10 @@ class ArduPilotCamera:
     def is_fitted(self) -> bool:
         return int(self._vehicle.parameters["CAM1_TYPE"]) != 0
 
-    @property
-    def _shutter_s(self) -> float:
-        return self._vehicle.parameters.get("CAM1_DURATION", _DEFAULT_SHUTTER_S)
-
     def take(self) -> bool:
         """Take an image. Return False without a camera, or while its shutter is still open."""
-        if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
+        shutter_s = self._vehicle.parameters.get("CAM1_DURATION", _DEFAULT_SHUTTER_S)
+        if not self.is_fitted or self._vehicle.now - self._taken_at < shutter_s:
             return False
         self.image_count += 1
         self._taken_at = self._vehicle.now

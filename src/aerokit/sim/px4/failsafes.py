@@ -43,10 +43,9 @@ class Px4Fence:
     @property
     def breaches(self) -> list[str]:
         """Texts that say how the vehicle breaches its geofence at present."""
-        motion = self._px4.motion
         if round(self._px4.parameters["GF_ACTION"]) == _NO_ACTION:
             return []
-        return self.breaches_at(motion.place)
+        return self.breaches_at(self._px4.motion.place)
 
     def allows(self, place: Ned) -> bool:
         action = round(self._px4.parameters["GF_ACTION"])
