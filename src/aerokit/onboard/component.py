@@ -81,19 +81,13 @@ class OnboardComponent:
         self._ftp: SessionFtpServer[DirectoryFiles] = SessionFtpServer(
             self._host, files, is_congested=self._is_congested
         )
-        self._identity.capabilities |= Capability.FTP
         self._events = EventSender(self._host)
         self._missions: ComponentMissions | None = None
         self._sources: ComponentSources | None = None
         answer_pings(self._host)
-        if bytewise:
-            self._identity.capabilities |= Capability.PARAM_ENCODE_BYTEWISE
-        else:
-            self._identity.capabilities |= Capability.PARAM_ENCODE_C_CAST
+        encoding = Capability.PARAM_ENCODE_BYTEWISE if bytewise else Capability.PARAM_ENCODE_C_CAST
+        self._identity.capabilities |= Capability.FTP | encoding
         self._identity.add_metadata(CompMetadataType.PARAMETER, PARAMETER_PATH, self.parameters.json)
-
-    def _start(self) -> None:
-        self._send_heartbeat()
 
     async def _aclose(self) -> None:
         self._commands.cancel_all()
