@@ -55,7 +55,7 @@ def camera_settings(camera: CameraDevice) -> m.CameraSettings:
 
 def _number(command: ReceivedCommand | None) -> int:
     """Return the requested number of a storage or stream. 0 means all."""
-    # `command` is None for a message that is streamed.
+    # `command` is None for a STORAGE_INFORMATION or VIDEO_STREAM_STATUS that is streamed, not requested.
     return 0 if command is None else to_int(command.param2)
 
 
@@ -76,8 +76,8 @@ def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[M
     """Return the requested images, or the last image for a periodic message (None)."""
     if command is None:
         return camera.captures.images[-1:]
-    # Param 2 is the index of the first image, or -1 for all images. Param 3 is the index of the last one, 0 for only
-    # one image, or -1 for all further images.
+    # REQUEST_MESSAGE for CAMERA_IMAGE_CAPTURED: param 2 is the index of the first image, or -1 for all images. Param 3
+    # is the index of the last one, 0 for only one image, or -1 for all further images.
     first, last = to_int(command.param2), to_int(command.param3)
     if first < 0:
         return list(camera.captures.images)
@@ -227,7 +227,7 @@ class _Pictures:
         return MavResult.ACCEPTED
 
     async def digicam_control(self, command: ReceivedCommand) -> int:
-        if command.x != 1:  # Param 5 is 1 to take an image.
+        if command.x != 1:  # Param 5 of DO_DIGICAM_CONTROL is 1 to take an image.
             return MavResult.ACCEPTED
         return await self.start_capture(replace(command, param1=0.0, param2=0.0, param3=1.0, param4=0.0))
 
@@ -239,7 +239,7 @@ class _Pictures:
             return MavResult.TEMPORARILY_REJECTED
         if command.param2 == 1.0:
             await camera.format_storage()
-        if command.param3 == 1.0:  # This parameter resets the image log.
+        if command.param3 == 1.0:  # Param 3 of STORAGE_FORMAT is 1 to reset the image log.
             captures.clear()
         return MavResult.ACCEPTED
 
@@ -269,7 +269,7 @@ class _Videos:
         except BaseException as error:
             self._was_cancelled = not isinstance(error, Exception)
             raise
-        # Param 2 is the rate of CAMERA_CAPTURE_STATUS in Hz; 0 requests no status.
+        # Param 2 of VIDEO_START_CAPTURE is the rate of CAMERA_CAPTURE_STATUS in Hz; 0 requests no status.
         status_interval_s = 1.0 / command.param2 if command.param2 else 0.0
         captures.record(status_interval_s)
         if self._must_stop:  # The command to stop arrived while the camera was starting.
@@ -359,7 +359,7 @@ class _Settings:
 
 
 def _selects_this_camera(target_camera: float) -> bool:
-    # 0 selects all cameras, 1 the first one. MAVSDK sends NaN.
+    # In a camera command, the number 0 selects all cameras, 1 the first one. MAVSDK sends NaN.
     return math.isnan(target_camera) or target_camera in (0.0, 1.0)
 
 

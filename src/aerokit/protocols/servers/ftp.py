@@ -139,7 +139,7 @@ class SessionFtpServer(Generic[FilesT]):
         return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 
     def _new_number(self, client: ServedClient, request: FtpPacket) -> int:
-        # A client may request a number, as MAVProxy does. 0 means any number.
+        # A client may choose the number of its new session, as MAVProxy does. 0 means any number.
         if request.session and request.session not in client.sessions:
             return request.session
         return next(number for number in range(self.max_sessions) if number not in client.sessions)

@@ -231,10 +231,10 @@ class GimbalRequests:
         if (refusal := self._refusal(command.param1, command)) is not None:
             return refusal
         scale = 1.0 if command.is_long else 1e-7
-        # This comparison also refuses NaN.
+        # `not <=` also refuses a NaN for the latitude or the longitude.
         if not (abs(command.x * scale) <= 90.0 and abs(command.y * scale) <= 180.0):
             return MavResult.DENIED
-        # The altitude of a COMMAND_LONG is above mean sea level.
+        # DO_SET_ROI_LOCATION as COMMAND_LONG has no frame. Its altitude is above mean sea level.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         altitude = command.z
         if frame not in _ABSOLUTE_FRAMES:

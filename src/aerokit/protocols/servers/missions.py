@@ -146,7 +146,7 @@ class MissionServer:
             for seq, item in enumerate(items):
                 message = item_message(item, seq, ComponentIds(), mission_type, as_int=True, current=False)
                 checksum = zlib.crc32(message.encode(), checksum)
-            self._opaque_ids[mission_type] = checksum or 1  # 0 means no id
+            self._opaque_ids[mission_type] = checksum or 1  # In MAVLink, the opaque id 0 means no id.
         return self._opaque_ids[mission_type] if items else 0
 
     def current_message(self) -> m.MissionCurrent:

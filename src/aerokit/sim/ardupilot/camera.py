@@ -109,7 +109,7 @@ class ArduPilotCamera:
         return True
 
     def start_capture(self, command: ReceivedCommand) -> int:
-        # Param 1 is the number of the camera. 0 selects all cameras.
+        # Param 1 of IMAGE_START_CAPTURE is the number of the camera. 0 selects all cameras.
         if command.param1 < 0.0:
             return MavResult.UNSUPPORTED
         if command.param1 > 1.0:
@@ -124,7 +124,7 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def digicam_control(self, command: ReceivedCommand | MissionItem) -> int:
-        takes_image = command.x == 1  # Param 5 of the command.
+        takes_image = command.x == 1  # Param 5 of DO_DIGICAM_CONTROL.
         if takes_image:
             self.take()
         return MavResult.ACCEPTED

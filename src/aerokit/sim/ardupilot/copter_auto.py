@@ -422,13 +422,13 @@ class CopterAuto(MissionMode):
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
-        if item.param4 > 0:  # The angle is relative. The direction (param 3) is its sign.
+        if item.param4 > 0:  # CONDITION_YAW: relative angle; param 3 is its sign.
             direction = direction or 1
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction)
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
-        if item.param2 <= 0:  # A value of -1 means no change.
+        if item.param2 <= 0:  # In DO_CHANGE_SPEED, -1 means no change.
             return
         if item.param1 == SpeedType.CLIMB_SPEED:
             self.climb = item.param2

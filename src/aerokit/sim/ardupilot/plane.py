@@ -177,7 +177,7 @@ class SimulatedPlane(PlaneHost):
         return self.change_to(PlaneMode.AUTO)
 
     def _reposition(self, command: ReceivedCommand) -> int:
-        if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
+        if command.is_long:  # ArduPilot requires the altitude frame of a COMMAND_INT.
             return MavResult.UNSUPPORTED
         point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:

@@ -85,7 +85,7 @@ class ArduPilotMessageRequests:
             return MavResult.DENIED
         if interval_us < -1:
             return MavResult.DENIED
-        # -1 and 0 turn the stream off. For HEARTBEAT, 0 selects the default of one second.
+        # SET_MESSAGE_INTERVAL: -1 and 0 turn a stream off. For HEARTBEAT, 0 selects the default of one second.
         interval = max(0, interval_us) / 1e6
         if interval_us == 0 and message_id == m.Heartbeat.ID:
             interval = 1.0

@@ -261,7 +261,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
-        # SITL is still in MAV_STATE_BOOT for about half a second after these texts.
+        # SITL is still in MAV_STATE_BOOT for about half a second after it has reported "ArduPilot Ready".
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:

@@ -101,7 +101,7 @@ _FORMAT_INTERVAL_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
 
 def _format(camera: SimulatedCamera, command: ReceivedCommand) -> int | CommandProgress:
     captures = camera.captures
-    is_card_known = command.param1 in (0.0, 1.0)  # 0 selects all cards, and the camera has one card.
+    is_card_known = command.param1 in (0.0, 1.0)  # STORAGE_FORMAT: 0 selects all cards; there is one card.
     if not is_card_known or not camera.card.is_inserted:
         return MavResult.DENIED
     if captures.is_busy or captures.is_recording:
@@ -323,7 +323,7 @@ class SimulatedCamera(SimulatedComponent, CameraDevice):
         return camera_builders(self)
 
     def expose(self, done: Callable[[CameraImageCaptured | None], None]) -> None:
-        # A camera that is a separate component has the id 0.
+        # CAMERA_IMAGE_CAPTURED has the camera id 0 if the camera is a separate component, not part of an autopilot.
         image = captured_image(self.vehicle, self.time_boot_ms, self.angles(), camera_id=0)
         self.call_later(self.shutter_s, lambda: done(image))
 
