@@ -324,9 +324,7 @@ class ArduPilotArming(Generic[HostT]):
     def on_armed(self) -> None: ...
 
     def _reasons_not_to_arm(self, *, force: bool) -> list[str]:
-        if not self.vehicle.is_initialised:
-            return ["System not initialised"]
-        if force:
+        if force and self.vehicle.is_initialised:
             return self.mandatory_reasons()
         return self.reasons() or self.final_reasons()
 

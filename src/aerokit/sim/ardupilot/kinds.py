@@ -18,7 +18,7 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
     """Return the parameters of a firmware. ``count`` limits how many are listed."""
-    return SimParameters.from_text(_read(f"{kind}.param.csv"), count)
+    return SimParameters(_read(f"{kind}.param.csv"), count)
 
 
 def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:

@@ -27,7 +27,7 @@ from aerokit.sim.px4.host import Px4Host
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
     """Return the parameters of a "quadrotor" or an "airplane". ``count`` limits how many are listed."""
-    return SimParameters.from_text(Path(__file__).with_name(f"{table}.param.csv").read_text("utf-8"), count)
+    return SimParameters(Path(__file__).with_name(f"{table}.param.csv").read_text("utf-8"), count)
 
 
 class Px4ParameterMount(ParameterPackMount):
