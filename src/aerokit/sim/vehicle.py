@@ -275,14 +275,9 @@ class SimulatedVehicle:
         """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
         self.call_at(self.now + delay, action)
 
-    def every(
-        self, interval: float, action: Callable[[], None], *, first: float | None = None, owner: object = None
-    ) -> None:
-        """Call a function every ``interval`` seconds. A reboot of the owner, see `call_at`, cancels all further calls.
-
-        ``first`` is the delay of the first call in seconds; None means ``interval``.
-        """
-        start = self.now + (interval if first is None else first)
+    def every(self, interval: float, action: Callable[[], None], *, owner: object = None) -> None:
+        """Call a function every ``interval`` seconds until the owner reboots. See `call_at`."""
+        start = self.now + interval
         count = 0
 
         def repeat() -> None:
