@@ -11,7 +11,7 @@ from provoked import Do, Provocation, Table
 
 from aerokit import messages as m
 from aerokit.sim import SimulatedCamera
-from aerokit.sim.components.camera_body import DEFINITION_PATH
+from aerokit.sim.components.camera import DEFINITION_PATH
 
 __all__ = ["SETTINGS"]
 

@@ -369,7 +369,7 @@ def _undo_termination(stage: Stage) -> None:
 
 
 def _switch_on(stage: Stage) -> None:
-    if stage.simulated.now > 0 and not stage.simulated._is_on:
+    if stage.simulated.now > 0 and not stage.simulated.is_on:
         stage.simulated.power_on()
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from call_stage import Stage
 
 from aerokit.sim import SimulatedCamera
-from aerokit.sim.components.camera_body import DEFINITION_PATH, own_definition
+from aerokit.sim.components.camera import DEFINITION_PATH, own_definition
 from aerokit.sim.faults import Faults
 from aerokit.vehicle.components.settings import Settings
 

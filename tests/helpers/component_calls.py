@@ -17,7 +17,7 @@ from aerokit.errors import OperationRejected
 from aerokit.mavlink.enums import MavCmd
 from aerokit.parameters import parse_definition
 from aerokit.sim import SimulatedCamera
-from aerokit.sim.components.camera_body import DEFINITION_PATH, own_definition
+from aerokit.sim.components.camera import DEFINITION_PATH, own_definition
 from aerokit.vehicle.components.component import Component
 
 __all__ = ["COMPONENTS", "COMPONENTS_AWAITED", "COMPONENTS_BLOCKING"]

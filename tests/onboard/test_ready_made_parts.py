@@ -37,7 +37,7 @@ from aerokit.onboard import (
 )
 from aerokit.position import Position
 from aerokit.protocols.rtcm import crc24q
-from aerokit.sim.components.camera_body import own_definition
+from aerokit.sim.components.camera import own_definition
 
 pytestmark = pytest.mark.anyio
 

@@ -58,6 +58,19 @@ def keep(client: Client, message: Any, seconds: float) -> None:
         client.run(0.5)
 
 
+@pytest.mark.parametrize(("kind", "mode"), [("rover", RoverMode.GUIDED), ("sub", SubMode.GUIDED)])
+def test_setpoints_work_after_reboot(kind: str, mode: int) -> None:
+    """The reboot makes new mode objects. The handlers of the set-points must use the new ones."""
+    vehicle, client = guided(kind, mode)
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 0) == 0
+    assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == 0
+    client.run(10.0)
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0
+    assert set_mode(client, mode) == 0
+    keep(client, local(MavFrame.LOCAL_NED, POS | ACC | YAW | RATE, velocity=(1.0, 0.0, 0.0)), 5.0)
+    assert vehicle.motion.north > 1.0
+
+
 # ----------------------------------------------------------------------------------------- rover
 
 

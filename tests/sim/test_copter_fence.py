@@ -29,7 +29,7 @@ def fly_east(copter: SimulatedCopter, client: Client) -> None:
 
 
 def upload(copter: SimulatedCopter, *items: MissionItem) -> None:
-    assert copter.missions.fence.store(items, lambda _: None) == 0
+    copter.missions.fence.replace(items, lambda _: None)
 
 
 def corner(copter: SimulatedCopter, north: float, east: float, *, count: int, inside: bool) -> MissionItem:

@@ -100,7 +100,7 @@ def test_plane_return_place_depends_on_parameters() -> None:
     plane.parameters["FENCE_RET_ALT"] = 70.0
     place = plane.frame.to_global(300.0, 100.0, 0.0)
     point = MissionItem(MavCmd.NAV_FENCE_RETURN_POINT, 0, x=place.latitude_e7, y=place.longitude_e7)
-    assert plane.missions.fence.store([point], lambda _: None) == 0
+    plane.missions.fence.replace([point], lambda _: None)
     assert plane.fence.return_place() == pytest.approx((300.0, 100.0, home[2] - 70.0), abs=0.1)
     plane.parameters["FENCE_RET_RALLY"] = 1.0
     plane.parameters["RTL_ALTITUDE"] = -1.0

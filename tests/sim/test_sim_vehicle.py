@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import MavCmd, MavDataStream, MavType
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.sim import ExtraComponent, SimulatedCopter, SimulatedWind
+from aerokit.sim.channel import datagrams
 
 
 def recorded(steps: list[float]) -> bytes:
@@ -112,10 +113,10 @@ def test_datagrams_hold_whole_frames() -> None:
     for _ in range(100):
         copter.send_text(6, "x" * 45)
     copter.step(copter.now)
-    datagrams = channel.take_datagrams()
-    assert len(datagrams) > 3
-    assert all(len(data) <= 1200 for data in datagrams)
-    assert sum(len(Framer().receive(data)) for data in datagrams) == 100
+    sent = datagrams(channel.take_pieces())
+    assert len(sent) > 3
+    assert all(len(data) <= 1200 for data in sent)
+    assert sum(len(Framer().receive(data)) for data in sent) == 100
 
 
 def test_extra_components_send_heartbeats() -> None:

@@ -27,13 +27,13 @@ def test_break_cancels_on_vehicle() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     with served([copter]) as address, aerokit.sync.connect(address) as vehicle:
         for _ in vehicle.calibrate.compass():
-            assert copter.calibrations.is_compass_running
+            assert copter.calibrations.compasses.is_running
             break
         gc.collect()
         deadline = time.monotonic() + 20
-        while copter.calibrations.is_compass_running and time.monotonic() < deadline:
+        while copter.calibrations.compasses.is_running and time.monotonic() < deadline:
             vehicle.mode.updates().__next__()  # the next HEARTBEAT
-        assert not copter.calibrations.is_compass_running
+        assert not copter.calibrations.compasses.is_running
 
 
 @contextmanager

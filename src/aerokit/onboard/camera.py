@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.rotations import quaternion_from_euler
@@ -13,6 +14,9 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     CameraCapFlags,
     CameraZoomType,
+    MavCmd,
+    MavResult,
+    ParamAck,
     SetFocusType,
     StorageStatus,
     StorageType,
@@ -20,13 +24,19 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.messages import CameraImageCaptured
 from aerokit.onboard.commands import overrides
+from aerokit.parameters import parse_definition
 from aerokit.position import Position
+from aerokit.protocols.servers.camera import camera_builders, camera_commands, legacy_requests
 from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevice
+from aerokit.protocols.servers.parameters import DefinedParameterServer
 
 if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
-    from aerokit.parameters import SettingValue
+    from aerokit.onboard.services import ComponentServices
+    from aerokit.parameters import CameraDefinition, SettingValue
+    from aerokit.protocols.servers.camera import AsyncHandler
+    from aerokit.protocols.servers.commands import ReceivedCommand
     from aerokit.protocols.servers.host import ServerHost
 
 
@@ -210,13 +220,10 @@ class CameraAdapter(CameraDevice):
         self.sensor_mm: tuple[float, float] = camera.sensor_mm
         self.streams: tuple[str, ...] = camera.streams
         self.capabilities: int = capabilities_of(camera)
+        self.host: ServerHost = host
         self._camera, self._host, self._tasks, self._call = camera, host, tasks, call
         self.set_up_captures()
         self.running_streams: set[int] = set(range(1, len(self.streams) + 1))
-
-    @property
-    def host(self) -> ServerHost:
-        return self._host
 
     @property
     def zoom(self) -> float:
@@ -365,3 +372,57 @@ def _image_of(photo: Photo, time_boot_ms: int, unix_time: float) -> CameraImageC
         capture_result=1,
         file_url=photo.url,
     )
+
+
+DEFINITION_PATH = "/camera_definition.xml"
+
+
+class DefinedSettings(DefinedParameterServer):
+    """Settings of a `CameraDriver` with a definition file."""
+
+    _host: ComponentHost  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __init__(
+        self, host: ComponentHost, definition: CameraDefinition, on_change: Callable[[str, SettingValue], Any]
+    ):
+        self._on_change = on_change
+        super().__init__(host, definition)
+
+    def set(self, name: str, data: bytes, kind: int) -> int:
+        old_value = self.values[name]
+        try:
+            return super().set(name, data, kind)
+        except Exception as error:  # The program's function has refused the new value.
+            self.values[name] = old_value
+            self._host.report_error(name, error)
+            return ParamAck.FAILED
+
+    def on_set(self, name: str, value: SettingValue) -> None:
+        self._on_change(name, value)
+
+
+def add_camera(services: ComponentServices, camera: CameraDriver) -> None:
+    host, streams = services.host, services.streams
+    adapter = CameraAdapter(camera, host, services.tasks, services.commands.call)
+    if m.CameraInformation.ID in streams.builders:
+        raise InvalidArgument("this component already has a camera: open another component for the second one")
+    if camera.definition is not None:
+        definition = parse_definition(camera.definition)
+        services.parameters._forbid_parameters()  # The camera's settings use the same messages.
+        DefinedSettings(host, definition, camera.on_setting)
+        services.memory.put(DEFINITION_PATH, camera.definition)
+        adapter.definition_version = definition.version
+        adapter.definition_uri = f"mftp://{DEFINITION_PATH}"
+    streams.builders.update(camera_builders(adapter))
+    for command, handler in camera_commands(adapter).items():
+        if command == MavCmd.STORAGE_FORMAT and not _implements(camera, "format_storage"):
+            continue  # The command stays UNSUPPORTED.
+        services.commands.add_raw(command, partial(_run_if_implemented, handler))
+    services.commands.add_guarded(legacy_requests(streams))
+
+
+async def _run_if_implemented(handler: AsyncHandler, command: ReceivedCommand) -> int:
+    try:
+        return await handler(command)
+    except NotImplementedError:  # The program's class does not override the method.
+        return MavResult.UNSUPPORTED

@@ -81,19 +81,13 @@ class OnboardComponent:
         self._ftp: SessionFtpServer[DirectoryFiles] = SessionFtpServer(
             self._host, files, is_congested=self._is_congested
         )
-        self._identity.capabilities |= Capability.FTP
         self._events = EventSender(self._host)
         self._missions: ComponentMissions | None = None
         self._sources: ComponentSources | None = None
         answer_pings(self._host)
-        if bytewise:
-            self._identity.capabilities |= Capability.PARAM_ENCODE_BYTEWISE
-        else:
-            self._identity.capabilities |= Capability.PARAM_ENCODE_C_CAST
+        encoding = Capability.PARAM_ENCODE_BYTEWISE if bytewise else Capability.PARAM_ENCODE_C_CAST
+        self._identity.capabilities |= Capability.FTP | encoding
         self._identity.add_metadata(CompMetadataType.PARAMETER, PARAMETER_PATH, self.parameters.json)
-
-    def _start(self) -> None:
-        self._send_heartbeat()
 
     async def _aclose(self) -> None:
         self._commands.cancel_all()
@@ -306,8 +300,7 @@ class OnboardComponent:
         The component serves them from the first access to this property on.
         """
         if self._missions is None:
-            self._missions = ComponentMissions(self._host, self._tasks, self._commands)
-            self._streams.builders[m.MissionCurrent.ID] = self._missions._build_current
+            self._missions = ComponentMissions(self._services)
             self._identity.capabilities |= Capability.MISSION_INT | Capability.MISSION_FENCE | Capability.MISSION_RALLY
         return self._missions
 
@@ -352,7 +345,7 @@ class OnboardComponent:
                 definition file) parameters.
             FileFormatError: the definition file is damaged.
         """
-        from aerokit.onboard.parts import add_camera  # Imported here, because few components need it.
+        from aerokit.onboard.camera import add_camera  # Imported here, because few components need it.
 
         add_camera(self._services, camera)
 
@@ -367,7 +360,7 @@ class OnboardComponent:
         Raises:
             InvalidArgument: the component already has a gimbal, or a handler for a gimbal command.
         """
-        from aerokit.onboard.parts import add_gimbal  # Imported here, because few components need it.
+        from aerokit.onboard.gimbal import add_gimbal  # Imported here, because few components need it.
 
         add_gimbal(self._services, gimbal)
 

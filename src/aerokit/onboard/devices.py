@@ -115,7 +115,7 @@ def _check_instance(services: ComponentServices, instance: float | None) -> None
 
 
 def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
-    # The arguments are the parameters of the command, in order.
+    # The arguments are the parameters of DO_WINCH, in order.
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
@@ -162,7 +162,7 @@ def _winch_arguments(method: str, length: float | None, rate: float | None) -> t
 def add_gripper(
     services: ComponentServices, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]
 ) -> None:
-    # The arguments are the parameters of the command, in order.
+    # The arguments are the parameters of DO_GRIPPER, in order.
     async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
         _check_instance(services, instance)
         if action == GripperActions.RELEASE:

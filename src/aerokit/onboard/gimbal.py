@@ -7,11 +7,20 @@ from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
+from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalDeviceCapFlags as DeviceCapFlags
 from aerokit.mavlink.enums import GimbalManagerFlags as ManagerFlags
 from aerokit.onboard.commands import overrides
 from aerokit.position import Position
-from aerokit.protocols.servers.gimbal import ALL_CAPABILITIES, Angles, GimbalMount, Place
+from aerokit.protocols.servers.gimbal import (
+    ALL_CAPABILITIES,
+    Angles,
+    GimbalMount,
+    Place,
+    gimbal_builders,
+    gimbal_commands,
+    listen_for_gimbal,
+)
 
 if TYPE_CHECKING:
     from aerokit.onboard.services import ComponentServices
@@ -118,17 +127,11 @@ class GimbalAdapter(GimbalMount):
                 self.capabilities &= ~axis_flags
         if yaw == _FULL_TURN_DEG:
             self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
-        self._gimbal, self._host, self._stop_functions = gimbal, services.host, services.stop_functions
+        self.host: ServerHost = services.host
+        self.device_id: int = services.host.component_id
+        self._gimbal, self._stop_functions = gimbal, services.stop_functions
         self._is_yaw_locked = False
         self._followed_system_id = 0  # system at which the gimbal points; 0 if there is none
-
-    @property
-    def host(self) -> ServerHost:
-        return self._host
-
-    @property
-    def device_id(self) -> int:
-        return self._host.component_id
 
     @property
     def is_yaw_locked(self) -> bool:
@@ -194,3 +197,16 @@ class GimbalAdapter(GimbalMount):
 _ROLL_FLAGS = DeviceCapFlags.HAS_ROLL_AXIS | DeviceCapFlags.HAS_ROLL_LOCK | DeviceCapFlags.HAS_ROLL_FOLLOW
 _PITCH_FLAGS = DeviceCapFlags.HAS_PITCH_AXIS | DeviceCapFlags.HAS_PITCH_LOCK | DeviceCapFlags.HAS_PITCH_FOLLOW
 _YAW_FLAGS = DeviceCapFlags.HAS_YAW_AXIS | DeviceCapFlags.HAS_YAW_LOCK | DeviceCapFlags.HAS_YAW_FOLLOW
+
+
+def add_gimbal(services: ComponentServices, gimbal: GimbalDriver) -> None:
+    streams = services.streams
+    if m.GimbalManagerInformation.ID in streams.builders:
+        raise InvalidArgument("this component already has a gimbal: open another component for the second one")
+    adapter = GimbalAdapter(gimbal, services)
+    streams.builders.update(gimbal_builders(adapter))
+    services.commands.add_guarded(gimbal_commands(adapter))
+    listen_for_gimbal(adapter)
+    streams.stream(m.GimbalManagerStatus.ID, STATUS_INTERVAL_S)
+    if gimbal.attitude_hz > 0:
+        streams.stream(m.GimbalDeviceAttitudeStatus.ID, 1.0 / gimbal.attitude_hz)

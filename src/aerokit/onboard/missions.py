@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
@@ -15,10 +15,8 @@ from aerokit.missions.check import check_items
 from aerokit.protocols.servers.missions import MissionServer
 
 if TYPE_CHECKING:
-    from aerokit.connection.tasks import BackgroundTasks
-    from aerokit.mavlink.message import Message
-    from aerokit.onboard.commands import CommandRequest, ComponentCommands
-    from aerokit.onboard.host import ComponentHost
+    from aerokit.onboard.commands import CommandRequest
+    from aerokit.onboard.services import ComponentServices
 
 _TYPES_BY_KIND = {"mission": MavMissionType.MISSION, "fence": MavMissionType.FENCE, "rally": MavMissionType.RALLY}
 
@@ -30,13 +28,13 @@ class ComponentMissions:
     By default every valid list is accepted and stored. :meth:`on_upload` registers a function that may refuse a list.
     """
 
-    def __init__(self, host: ComponentHost, tasks: BackgroundTasks, commands: ComponentCommands) -> None:
-        self._host, self._tasks, self._commands = host, tasks, commands
-        self._server = MissionServer(host, self._accept_or_refuse, on_set_current=self._set_current)
-        self._server.listen()
+    def __init__(self, services: ComponentServices) -> None:
+        self._host, self._tasks, self._commands = services.host, services.tasks, services.commands
+        self._server = MissionServer(self._host, self._accept_or_refuse, on_set_current=self._set_current)
         self._on_upload: Callable[[str, tuple[MissionItem, ...]], Any] | None = None
         self._on_current: Callable[[int], object] | None = None
-        commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._do_set_current)
+        self._commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._do_set_current)
+        services.streams.builders[m.MissionCurrent.ID] = lambda _: [self._server.current_message()]
 
     def items(self, kind: str = "mission") -> tuple[MissionItem, ...]:
         """Return the items of ``"mission"``, ``"fence"`` or ``"rally"``; InvalidArgument for other kinds."""
@@ -95,9 +93,6 @@ class ComponentMissions:
     def report_reached(self, index: int) -> None:
         """Report that an item was reached (MISSION_ITEM_REACHED)."""
         self._host.send(m.MissionItemReached(index))
-
-    def _build_current(self, _: object) -> Iterable[Message]:
-        return [self._server.current_message()]
 
     def _accept_or_refuse(
         self, mission_type: int, items: tuple[MissionItem, ...], answer: Callable[[int], None]

@@ -131,7 +131,7 @@ async def component(
         )
         connection.components.add(key)
         try:
-            onboard_component._start()
+            onboard_component._send_heartbeat()
             yield onboard_component
         finally:
             try:

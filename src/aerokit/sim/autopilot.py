@@ -23,6 +23,7 @@ from aerokit.sim.parameter_server import ParameterServer
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
+_REBOOT_SILENCE_S = 1.5
 _CORRECTIONS_MAX_AGE_S = 5.0
 _MAX_CORRECTIONS = 1000
 
@@ -235,6 +236,10 @@ class SimulatedAutopilot(SimulatedVehicle):
     def make_signing(self, key: SigningKey | None, timestamp: int) -> VehicleSigning:
         """Create the signing of this firmware, with a stored key and time stamp."""
         raise NotImplementedError
+
+    def restart(self) -> None:
+        """Reboot, with the silence of the real firmware."""
+        self.reboot(_REBOOT_SILENCE_S)
 
     def on_speedup(self, speedup: float) -> None:
         """Multiply the timeouts that are not parameters. Called by `aerokit.sim.kinds.scale_timeouts`."""

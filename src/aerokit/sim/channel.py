@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Container, Hashable, Iterable
+from collections.abc import Container, Hashable, Sequence
 from heapq import heappop, heappush, heapreplace
 from typing import Any, TypeVar
 
@@ -195,7 +195,8 @@ class Channel:
         self.reader: MessageReader = MessageReader(wanted)
         """Decodes incoming bytes. Several vehicles on one link may share a reader."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
-        self._outbox: list[bytes] = []
+        self.outbox: list[bytes] = []
+        """Frames, and other pieces that must not be divided."""
         self.closes_clients: bool = False
         """True if the vehicle wants the server to disconnect the clients of this (TCP) port."""
         self.signing: Signing | None = None
@@ -233,28 +234,17 @@ class Channel:
     def write(self, data: bytes) -> None:
         """Append a frame to the outbox, or other bytes that must not be divided."""
         if data:
-            self._outbox.append(data)
-
-    @property
-    def has_output(self) -> bool:
-        return bool(self._outbox)
+            self.outbox.append(data)
 
     def take_outbox(self) -> bytes:
         """Return and clear the outbox."""
-        if not self._outbox:
-            return b""
-        data = b"".join(self._outbox)
-        self._outbox.clear()
-        return data
+        return b"".join(self.take_pieces())
 
     def take_pieces(self) -> list[bytes]:
         """Return and clear the outbox, with one element for each call of `write`."""
-        pieces = self._outbox
-        self._outbox = []
+        pieces = self.outbox
+        self.outbox = []
         return pieces
-
-    def take_datagrams(self) -> list[bytes]:
-        return datagrams(self.take_pieces())
 
     def reset(self) -> None:
         """Reset stream rates, partial frames and sequence numbers. The outbox is kept."""
@@ -263,11 +253,8 @@ class Channel:
         self._encoders.clear()
 
 
-def datagrams(pieces: Iterable[bytes]) -> list[bytes]:
+def datagrams(pieces: Sequence[bytes]) -> list[bytes]:
     """Join the pieces, in their order, into as few datagrams as possible."""
-    pieces = list(pieces)
-    if sum(map(len, pieces)) <= _DATAGRAM_SIZE:
-        return [b"".join(pieces)] if pieces else []
     joined: list[bytes] = []
     datagram = b""
     for piece in pieces:

@@ -6,7 +6,6 @@ https://mavlink.io/en/services/command.html
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from aerokit.mavlink.enums import MavSeverity
@@ -25,22 +24,15 @@ from aerokit.sim.vehicle import MessageHost
 class CommandServer(commands.CommandDispatcher):
     """Answers commands. The `Faults` of the vehicle or component change the answers."""
 
-    def __init__(
-        self,
-        vehicle: MessageHost,
-        handlers: dict[int, CommandHandler],
-        refusal: Callable[[ReceivedCommand], int | None] = lambda _: None,
-    ) -> None:
-        super().__init__(vehicle, handlers, refusal)
-        self._vehicle = vehicle
+    _host: MessageHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def dispatch(self, command: ReceivedCommand) -> None:
-        fault = self._vehicle.faults.next_command_fault(command.command)
+        fault = self._host.faults.next_command_fault(command.command)
         if fault is not None and fault.ignore:
             return
         if fault is not None and fault.refuse_with is not None:
             if fault.text is not None:
-                self._vehicle.send_text(MavSeverity.CRITICAL, fault.text)
+                self._host.send_text(MavSeverity.CRITICAL, fault.text)
             self._answer_with(command, fault.refuse_with, fault)
             return
         answer = self.handle(command)
@@ -59,7 +51,7 @@ class CommandServer(commands.CommandDispatcher):
             return
         for _ in range(fault.acks):
             if fault.delay_s > 0:
-                self._vehicle.call_later(fault.delay_s, lambda: self.answer(command, result))
+                self._host.call_later(fault.delay_s, lambda: self.answer(command, result))
             else:
                 self.answer(command, result)
 

@@ -52,6 +52,9 @@ class SimulatedLog:
         return self.size * 31 + self.time_utc if self.seed is None else self.seed
 
 
+DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
+
+
 class LogServer:
     """Sends lists and contents of logs at ``rate_hz`` messages per second, in groups of ``burst`` messages.
 

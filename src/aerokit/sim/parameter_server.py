@@ -38,6 +38,10 @@ class ParameterServer(servers.ParameterProtocolServer):
         if name not in self._vehicle.faults.mute_parameters:
             super().send(name, index, channel)
 
+    def send_error(self, to: ComponentIds, name: str, index: int, code: int, channel: Channel) -> None:
+        if self.sends_errors:
+            super().send_error(to, name, index, code, channel)
+
     def clamped(self, name: str, value: float) -> float:
         """Apply `Faults.parameter_limits` to a value."""
         low, high = self._vehicle.faults.parameter_limits.get(name, (value, value))
@@ -106,7 +110,7 @@ class ArduPilotParameterServer(ParameterServer):
             name = names[index] if 0 <= index < len(names) else ""
         if name in self._parameters:
             self.send(name, index & 0xFFFF, channel)  # In a read by name, the index is -1, which becomes 65535.
-        elif self.sends_errors:
+        else:
             self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
@@ -127,8 +131,7 @@ class ArduPilotParameterServer(ParameterServer):
             self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
 
     def _refuse(self, request: ParamSet, code: int, channel: Channel) -> None:
-        if self.sends_errors:
-            self.send_error(sender_of(request), request.param_id, -1, code, channel)
+        self.send_error(sender_of(request), request.param_id, -1, code, channel)
 
 
 def rounded(value: float, type_: int) -> float:
@@ -178,13 +181,13 @@ class Px4ParameterServer(ParameterServer):
             if index < len(names):
                 self.send(names[index], index, channel)
             else:
-                self._refuse(sender, "", index, MavParamError.DOES_NOT_EXIST, channel)
+                self.send_error(sender, "", index, MavParamError.DOES_NOT_EXIST, channel)
         elif request.param_id == HASH_NAME:
             self._send_hash(channel)
         elif request.param_id in self._parameters:
             self.send(request.param_id, self._parameters.index(request.param_id), channel)
         else:
-            self._refuse(sender, request.param_id, _UNUSED_INDEX, MavParamError.DOES_NOT_EXIST, channel)
+            self.send_error(sender, request.param_id, _UNUSED_INDEX, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name, parameters = request.param_id, self._parameters
@@ -192,7 +195,7 @@ class Px4ParameterServer(ParameterServer):
             self.stop_list(channel)
         code = self._error_for(name, request.param_type)
         if code is not None:
-            self._refuse(sender_of(request), name, _UNUSED_INDEX, code, channel)
+            self.send_error(sender_of(request), name, _UNUSED_INDEX, code, channel)
             return
         value = value_of(request, bytewise=True)
         previous = parameters[name]
@@ -213,7 +216,3 @@ class Px4ParameterServer(ParameterServer):
         if type_ not in (MavParamType.INT32, MavParamType.REAL32):
             return MavParamError.TYPE_UNSUPPORTED
         return None if type_ == self._parameters.type(name) else MavParamError.TYPE_MISMATCH
-
-    def _refuse(self, to: ComponentIds, name: str, index: int, code: int, channel: Channel) -> None:
-        if self.sends_errors:
-            self.send_error(to, name, index, code, channel)

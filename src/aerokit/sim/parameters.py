@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -40,11 +40,6 @@ class SimParameter:
     default: float
     is_volatile: bool = False
     """True if the parameter is excluded from PX4's hash, because the vehicle changes its value."""
-    switch: str | None = None
-    """Name of the parameter that enables this parameter; None without one.
-
-    While the enabling parameter is 0, ArduPilot omits this parameter from lists and counts, but answers reads by name.
-    """
 
     def as_parameter(self, index: int | None = None) -> Parameter:
         """Convert to the client's class. Values of integer types become int."""
@@ -59,28 +54,21 @@ class SimParameters:
 
     A value is stored in the type of the parameter: as a 32-bit float, or as an integer, which is truncated and limited
     to the range of the type.
+
+    ``text`` has lines of ``name,type,value[,default[,switch]]``. The switch is the name of the parameter that enables
+    this one, or ``v`` for a volatile parameter. While the enabling parameter is 0, ArduPilot omits this parameter from
+    lists and counts, but answers reads by name. ``count`` is the number of parameters to list. The others can only be
+    read and set by name.
     """
 
-    def __init__(self, rows: Iterable[SimParameter]) -> None:
-        self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
+    def __init__(self, text: str, count: int | None = None) -> None:
+        # `_unlisted` has the names that the list leaves out.
+        lines, switches, self._unlisted = _lines_and_switches(text, count)
+        self._rows: dict[str, SimParameter | str] = dict(lines)
         # Maps the name of a parameter to the name of the parameter that enables it.
-        self._switches = {row.name: row.switch for row in map(self.row, self._rows) if row.switch is not None}
-        self._unlisted: frozenset[str] = frozenset()  # names that the list leaves out
+        self._switches: dict[str, str] = dict(switches)
         self._names: tuple[str, ...] | None = None  # None if they must be computed at the next access
         self._indices: dict[str, int] = {}
-
-    @classmethod
-    def from_text(cls, text: str, count: int | None = None) -> SimParameters:
-        """Parse lines of ``name,type,value[,default[,switch]]``.
-
-        The switch is the name of the parameter that enables this one, or ``v`` for a volatile parameter. ``count`` is
-        the number of parameters to list. The others can only be read and set by name.
-        """
-        parameters = cls(())
-        lines, switches, parameters._unlisted = _lines_and_switches(text, count)
-        parameters._rows = dict(lines)
-        parameters._switches = dict(switches)
-        return parameters
 
     def __getitem__(self, name: str) -> float:
         try:
@@ -169,10 +157,8 @@ def _row(fields: list[str]) -> SimParameter:
     name, type_text, value_text = fields[:3]
     type_, value = int(type_text), float(value_text)
     default = float(fields[3]) if len(fields) > 3 else value
-    switch_or_mark = fields[4] if len(fields) > 4 else None
-    is_volatile = switch_or_mark == _VOLATILE
-    switch = None if is_volatile else switch_or_mark
-    return SimParameter(name, type_, stored_value(value, type_), stored_value(default, type_), is_volatile, switch)
+    is_volatile = fields[4:] == [_VOLATILE]
+    return SimParameter(name, type_, stored_value(value, type_), stored_value(default, type_), is_volatile)
 
 
 def _switch_of(line: str) -> str | None:
@@ -186,7 +172,7 @@ def _switch_of(line: str) -> str | None:
 def _lines_and_switches(
     text: str, count: int | None
 ) -> tuple[dict[str, SimParameter | str], dict[str, str], frozenset[str]]:
-    """Return the lines and their switches (see `SimParameter`), both by name, and the names that are not listed."""
+    """Return the lines and their switches (see `SimParameters`), both by name, and the names that are not listed."""
     lines: dict[str, SimParameter | str] = {line.partition(",")[0]: line for line in text.split()}
     all_switches = {name: _switch_of(str(line)) for name, line in lines.items()}
     switches = {name: switch for name, switch in all_switches.items() if switch is not None}

@@ -142,8 +142,9 @@ class SimulatorServer:
         self._stop()
         task = self._block_task
         self._block_task = None
-        if self._has_cancelled_block and task is not None and task is asyncio.current_task():
-            _uncancel(task)
+        is_in_block = task is not None and task is asyncio.current_task()
+        if sys.version_info >= (3, 11) and self._has_cancelled_block and is_in_block:
+            task.uncancel()
         if self.failure is not None and self.failure is not error:
             raise self.failure  # Python makes `error` the context of this exception.
 
@@ -291,13 +292,11 @@ class _Port:
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
         """Return the datagrams to send. With ``together``, several vehicles of a fleet may share a datagram."""
-        active = [channel for channel in self.channels if channel.has_output]
-        if not active:
-            return []
+        outputs = [channel.take_pieces() for channel in self.channels if channel.outbox]
         is_fleet = len(self.channels) > _BATCH_THRESHOLD
         if together and is_fleet:
-            return datagrams(piece for channel in active for piece in channel.take_pieces())
-        return [datagram for channel in active for datagram in channel.take_datagrams()]
+            outputs = [[piece for pieces in outputs for piece in pieces]]
+        return [datagram for pieces in outputs for datagram in datagrams(pieces)]
 
     def disconnect_clients(self) -> None:
         """Disconnect the clients of a TCP port whose only vehicle reboots."""
@@ -318,11 +317,6 @@ class _Port:
     async def close(self) -> None:
         self.link.close()
         await self.link.wait_closed()
-
-
-def _uncancel(task: asyncio.Task[Any]) -> None:
-    if sys.version_info >= (3, 11):
-        task.uncancel()
 
 
 def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list[Channel]:

@@ -123,7 +123,8 @@ class SimulatedVehicle:
         self._first_tick_at = self._next_tick_at = math.inf  # infinity while the vehicle does not tick
         self._ticks_done = 0  # since `_first_tick_at`, in units of TICK_S
         self._text_id = 0  # id of the last STATUSTEXT that was split into several messages
-        self._is_on = False  # False before the power-on and during a reboot
+        self.is_on: bool = False
+        """False before the power-on and during a reboot."""
         self._at_power_on: list[Callable[[], None]] = []  # functions to call at each power-on
         self.channels: list[Channel] = []
         self._channel = self.open_channel()  # the first channel
@@ -134,7 +135,7 @@ class SimulatedVehicle:
         """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""
         channel = Channel(self.system_id, self.component_id, self.handlers, version=version)
         self.channels.append(channel)
-        if self._is_on:
+        if self.is_on:
             self.start_channel(channel)
         return channel
 
@@ -142,7 +143,7 @@ class SimulatedVehicle:
         """Process bytes from a peer, and put the replies into the outbox."""
         self.step(now)
         channel = self._channel if channel is None else channel
-        if self.faults.frozen or self.faults.silent or not self._is_on:
+        if self.faults.frozen or self.faults.silent or not self.is_on:
             return
         messages = channel.messages(data, now, peer)
         if not messages:
@@ -161,7 +162,7 @@ class SimulatedVehicle:
 
     def step(self, now: float) -> None:
         """Run everything that is due up to ``now``."""
-        if not self._is_on and math.isnan(self.booted_at):  # The vehicle was never switched on.
+        if not self.is_on and math.isnan(self.booted_at):  # The vehicle was never switched on.
             self.now = now
             self.power_on()
         if self.faults.frozen:  # Nothing runs, but the time passes.
@@ -175,7 +176,7 @@ class SimulatedVehicle:
     @property
     def next_due(self) -> float:
         """Time of the next event; infinity if there is none."""
-        if not self._is_on and math.isnan(self.booted_at):  # `step` must switch on the vehicle at once.
+        if not self.is_on and math.isnan(self.booted_at):  # `step` must switch on the vehicle at once.
             return self.now
         if self.faults.frozen:
             return self.now + TICK_S  # `step` must be called even if nothing happens, because it advances the time.
@@ -207,15 +208,10 @@ class SimulatedVehicle:
     def time_boot_us(self) -> int:
         return int((self.now - self.booted_at) * 1e6)
 
-    @property
-    def is_on(self) -> bool:
-        """False before the power-on and during a reboot."""
-        return self._is_on
-
     def power_on(self) -> None:
         """Boot now."""
         self.booted_at = self.now
-        self._is_on = True
+        self.is_on = True
         self.boot()
         for channel in self.channels:
             self.start_channel(channel)
@@ -225,7 +221,7 @@ class SimulatedVehicle:
     def on_power_on(self, action: Callable[[], None]) -> None:
         """Call a function at each power-on and reboot. If the vehicle is on already, also call it immediately."""
         self._at_power_on.append(action)
-        if self._is_on:
+        if self.is_on:
             action()
 
     def reboot(self, silence_s: float) -> None:
@@ -234,7 +230,7 @@ class SimulatedVehicle:
         Components have their own power supply and keep running, but the vehicle forwards none of their messages
         meanwhile.
         """
-        self._is_on = False
+        self.is_on = False
         self.cancel_timers(owner=None)
         self.set_ticking(False)
         for channel in self.channels:
@@ -279,14 +275,9 @@ class SimulatedVehicle:
         """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""
         self.call_at(self.now + delay, action)
 
-    def every(
-        self, interval: float, action: Callable[[], None], *, first: float | None = None, owner: object = None
-    ) -> None:
-        """Call a function every ``interval`` seconds. A reboot of the owner, see `call_at`, cancels all further calls.
-
-        ``first`` is the delay of the first call in seconds; None means ``interval``.
-        """
-        start = self.now + (interval if first is None else first)
+    def every(self, interval: float, action: Callable[[], None], *, owner: object = None) -> None:
+        """Call a function every ``interval`` seconds until the owner reboots. See `call_at`."""
+        start = self.now + interval
         count = 0
 
         def repeat() -> None:
@@ -338,9 +329,7 @@ class SimulatedVehicle:
         for channel in self.channels:
             if channel.streams.next_due <= due:
                 for message_id in channel.streams.take_due(due):
-                    message = self.build(message_id)
-                    if message is not None:
-                        self.send(message, channel)
+                    self.send_built(message_id, channel)
 
     def _skip_to(self, now: float) -> None:
         """Set the time to ``now``. All events are delayed by the skipped time, as in a program that has hung."""
@@ -361,7 +350,7 @@ class SimulatedVehicle:
     def observe(self, message_class: type[Message], handler: Handler) -> None:
         """Call a handler for all messages of a class, with any address, in addition to the vehicle's own handler."""
         self._observers.setdefault(message_class.ID, []).append(handler)
-        self.handlers.setdefault(message_class.ID, _ignore)
+        self.handlers.setdefault(message_class.ID, lambda _message, _channel: None)
 
     def is_addressed(self, message: Message) -> bool:
         """Return True if a message is addressed to this component or broadcast."""
@@ -426,7 +415,3 @@ class SimulatedVehicle:
     def _record_text(self, severity: int, text: str) -> None:
         if self.journal is not None:
             self.journal.on_text_sent(self.now, severity, text)
-
-
-def _ignore(_message: Message, _channel: Channel) -> None:
-    pass

@@ -122,7 +122,8 @@ class FixedWing(Motion):
             self._update_gusts(dt)
         was_on_ground = self.is_on_ground
         velocity_before = self.velocity
-        if was_on_ground and not self._lifts_off(powered=powered):
+        lifts_off = powered and self._wanted_climb > 0.0 and self._speed >= self.wing_limits.airspeed_min_m_s
+        if was_on_ground and not lifts_off:
             self._taxi(dt, powered=powered)
         else:
             self._fly(dt, powered=powered)
@@ -134,9 +135,6 @@ class FixedWing(Motion):
         super().settle()
         self._speed = self.throttle = 0.0
         self.roll_out()
-
-    def _lifts_off(self, *, powered: bool) -> bool:
-        return powered and self._wanted_climb > 0.0 and self._speed >= self.wing_limits.airspeed_min_m_s
 
     def _taxi(self, dt: float, *, powered: bool) -> None:
         wanted_speed = self._wanted_airspeed if powered else 0.0
@@ -268,13 +266,11 @@ class GroundMotion(Motion):
         self._wanted_turn_rate = 0.0
         self._wanted_heading = heading
 
-    def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True) -> None:
-        """Drive to a point at up to this speed in m/s. With ``stops``, the rover brakes and stops at the point."""
-        offset_north, offset_east = north - self.north, east - self.east
-        distance = math.hypot(offset_north, offset_east)
+    def drive_to(self, place: Ned, *, speed: float, stops: bool = True) -> None:
+        """Drive to a place at up to this speed in m/s. With ``stops``, the rover brakes and stops at the place."""
         if stops:
-            speed = min(speed, approach_speed(distance, self.wheels.acceleration_m_s2))
-        course = math.atan2(offset_east, offset_north)
+            speed = min(speed, approach_speed(self.distance_to(place), self.wheels.acceleration_m_s2))
+        course = self.bearing_to(place)
         if abs(wrap_pi(course - self.yaw)) > _SLOW_TURN_ERROR_RAD:  # Drive slowly until the rover has turned.
             speed = min(speed, _SLOW_M_S)
         self.head(speed, course)

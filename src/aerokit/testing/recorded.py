@@ -26,8 +26,7 @@ from aerokit.protocols.servers.missions import (
     ListUpload,
     MissionServer,
     item_from,
-    item_message_float,
-    item_message_int,
+    item_message,
 )
 from aerokit.protocols.servers.parameters import ParameterProtocolServer
 from aerokit.sim.channel import Channel
@@ -115,7 +114,6 @@ class RecordedMissions(MissionServer):
         self._written: dict[int, tuple[AnyItem, ...]] = {}  # uploaded plans by MAV_MISSION_TYPE
         # Number of recorded results that were already sent, by operation and MAV_MISSION_TYPE.
         self._result_counts: dict[tuple[str, int], int] = {}
-        self.listen()
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
         """Return the items of the plan that the vehicle has at present; None without such a plan."""
@@ -139,18 +137,17 @@ class RecordedMissions(MissionServer):
             is_recorded = self.items(kind) is not None
         return None if is_recorded else MavMissionResult.UNSUPPORTED
 
-    def _item(self, mission_type: int, seq: int) -> MissionItem | int:
+    def item(self, mission_type: int, seq: int) -> MissionItem | None:
         items = self.items(mission_type) or ()
-        return item_from(items[seq]) if seq < len(items) else MavMissionResult.INVALID_SEQUENCE
+        return item_from(items[seq]) if seq < len(items) else None
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         recorded = (self.items(request.mission_type) or ())[request.seq]
         wants_float = isinstance(request, m.MissionRequest)
         return _item_message(recorded, request.seq, sender_of(request), wants_float=wants_float)
 
-    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> None:
         self._received[message.seq :] = [message]
-        return MavMissionResult.ACCEPTED
 
     def _finish(self, upload: ListUpload) -> None:
         kind = upload.mission_type
@@ -187,13 +184,12 @@ def _item_message(item: AnyItem, seq: int, client: ComponentIds, *, wants_float:
     # numbers without a scale.
     scale = 1.0 if item.frame == MavFrame.MISSION else 1e4 if item.frame in LOCAL_FRAMES else 1e7
     was_float = isinstance(item, m.MissionItem)
+    place = (item.x, item.y) if was_float else (item.x / scale, item.y / scale)
     converted = item_from(item)  # with x and y as recorded
-    if wants_float:
-        place = (item.x, item.y) if was_float else (item.x / scale, item.y / scale)
-        return item_message_float(converted, place, seq, client, item.mission_type, item.current)
-    if was_float:
+    if was_float and not wants_float:
         converted = converted.replace(x=round(item.x * scale), y=round(item.y * scale))
-    return item_message_int(converted, seq, client, item.mission_type, current=bool(item.current))
+    current = bool(item.current)
+    return item_message(converted, seq, client, item.mission_type, as_int=not wants_float, current=current, place=place)
 
 
 _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
@@ -265,7 +261,7 @@ class RecordedVehicle(SimulatedVehicle):
     @property
     def has_ended(self) -> bool:
         """True if the whole recording was played and the vehicle is silent."""
-        return not self._is_on and self._next >= len(self.recording.stream)
+        return not self.is_on and self._next >= len(self.recording.stream)
 
     def boot(self) -> None:
         stream = self.recording.stream
@@ -306,7 +302,7 @@ class RecordedVehicle(SimulatedVehicle):
         if self._repeat and self.recording.duration_s > self._start_s:
             self.boot()
         else:
-            self._is_on = False
+            self.is_on = False
 
     def _on_command(self, command: ReceivedCommand) -> int | None:
         answer = self._answer_to(command)

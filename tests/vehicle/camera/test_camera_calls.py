@@ -206,7 +206,7 @@ async def test_load_storage_returns_all_media() -> None:
 
     def storage(number: int) -> list[m.StorageInformation]:
         """A camera that is slow to report its second medium unless that one is requested."""
-        (card,) = camera.card.information(camera, 1)
+        (card,) = SimulatedCamera.storage(camera, 1)
         fields: dict[str, Any] = card.to_dict() | {"storage_count": 2, "storage_id": number or 1}
         return [m.StorageInformation(**fields)]
 

@@ -14,7 +14,7 @@ import pytest
 from aerokit._internal.files import MAX_FILE_SIZE
 from aerokit.errors import FileFormatError, FileTimeout, OperationRejected
 from aerokit.parameters import parse_definition
-from aerokit.sim.components.camera_body import own_definition
+from aerokit.sim.components.camera import own_definition
 from aerokit.vehicle.components.session import fetch
 
 pytestmark = pytest.mark.anyio

@@ -28,7 +28,7 @@ from aerokit.mavlink.enums import CameraMode, MavCmd, MavParamExtType, ParamAck
 from aerokit.mavlink.message import Message
 from aerokit.parameters import Setting
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal, simulated_link
-from aerokit.sim.components.camera_body import DEFINITION_PATH, own_definition
+from aerokit.sim.components.camera import DEFINITION_PATH, own_definition
 from aerokit.vehicle.components.settings import Settings
 
 pytestmark = pytest.mark.anyio

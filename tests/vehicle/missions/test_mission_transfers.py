@@ -22,9 +22,8 @@ from aerokit.errors import (
     VerificationFailed,
 )
 from aerokit.mavlink import FrameEncoder
-from aerokit.mavlink.enums import MavFtpOpcode
+from aerokit.mavlink.enums import MavFtpOpcode, MavMissionType
 from aerokit.mavlink.enums import MavMissionResult as Result
-from aerokit.mavlink.enums import MavMissionType
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.compare import ItemStorage

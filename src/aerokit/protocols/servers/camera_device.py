@@ -33,6 +33,8 @@ class CameraDevice:
     result.
     """
 
+    host: ServerHost
+    """The component that serves the camera."""
     vendor: str = "aerokit"
     model: str = "camera"
     firmware_version: int = 1 << 24
@@ -54,11 +56,6 @@ class CameraDevice:
     """Minimum time between two images of a series."""
     mode: int = CameraMode.IMAGE
     source: int = CameraSource.DEFAULT
-
-    @property
-    def host(self) -> ServerHost:
-        """The component that serves the camera."""
-        raise NotImplementedError
 
     def set_up_captures(self) -> None:
         """Create the image log and the tracking; call this once."""

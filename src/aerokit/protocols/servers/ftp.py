@@ -139,7 +139,7 @@ class SessionFtpServer(Generic[FilesT]):
         return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 
     def _new_number(self, client: ServedClient, request: FtpPacket) -> int:
-        # A client may request a number, as MAVProxy does. 0 means any number.
+        # A client may choose the number of its new session, as MAVProxy does. 0 means any number.
         if request.session and request.session not in client.sessions:
             return request.session
         return next(number for number in range(self.max_sessions) if number not in client.sessions)
@@ -208,9 +208,6 @@ class SessionFtpServer(Generic[FilesT]):
 
     def _unknown(self, request: FtpPacket) -> FtpPacket:
         return request.refuse(MavFtpErr.UNKNOWNCOMMAND)
-
-    def _none(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
-        return request.acknowledge(request.data[: request.size])
 
     def _terminate(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
         session = self._session_of(client, request)
@@ -411,7 +408,7 @@ def _line(entry: Entry) -> bytes:
 
 
 _HANDLERS: dict[int, Callable[[SessionFtpServer[Any], ServedClient, FtpPacket], FtpPacket | None]] = {
-    Op.NONE: lambda server, client, request: server._none(client, request),
+    Op.NONE: lambda _server, _client, request: request.acknowledge(request.data[: request.size]),
     Op.TERMINATESESSION: lambda server, client, request: server._terminate(client, request),
     Op.RESETSESSION: lambda server, client, request: server._reset(client, request),
     Op.LISTDIRECTORY: lambda server, client, request: server._list(client, request),

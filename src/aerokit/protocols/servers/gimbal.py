@@ -49,6 +49,10 @@ class GimbalMount:
     Angles are in radians: roll and pitch from the horizon, yaw from the vehicle's nose or, if locked, from north.
     """
 
+    host: ServerHost
+    """The component that serves the gimbal."""
+    device_id: int
+    """Component id of the gimbal, which commands use to select it."""
     vendor: str = "aerokit"
     model: str = "gimbal"
     capabilities: int = ALL_CAPABILITIES
@@ -63,16 +67,6 @@ class GimbalMount:
     """The component in secondary control; zeros if none."""
     flags: int = 0
     """GIMBAL_MANAGER_FLAGS of the latest command."""
-
-    @property
-    def host(self) -> ServerHost:
-        """The component that serves the gimbal."""
-        raise NotImplementedError
-
-    @property
-    def device_id(self) -> int:
-        """Component id of the gimbal, which commands use to select it."""
-        raise NotImplementedError
 
     @property
     def is_yaw_locked(self) -> bool:
@@ -237,10 +231,10 @@ class GimbalRequests:
         if (refusal := self._refusal(command.param1, command)) is not None:
             return refusal
         scale = 1.0 if command.is_long else 1e-7
-        # This comparison also refuses NaN.
+        # `not <=` also refuses a NaN for the latitude or the longitude.
         if not (abs(command.x * scale) <= 90.0 and abs(command.y * scale) <= 180.0):
             return MavResult.DENIED
-        # The altitude of a COMMAND_LONG is above mean sea level.
+        # DO_SET_ROI_LOCATION as COMMAND_LONG has no frame. Its altitude is above mean sea level.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         altitude = command.z
         if frame not in _ABSOLUTE_FRAMES:

@@ -36,7 +36,7 @@ class MessageStreams:
 
     def commands(self) -> dict[int, CommandHandler]:
         return {
-            MavCmd.REQUEST_MESSAGE: self._request_message,
+            MavCmd.REQUEST_MESSAGE: lambda command: self.answer_with(to_int(command.param1), command),
             MavCmd.SET_MESSAGE_INTERVAL: self._set_interval,
             MavCmd.GET_MESSAGE_INTERVAL: self._get_interval,
         }
@@ -90,9 +90,6 @@ class MessageStreams:
         for message in messages:
             self._host.send(message, command.channel)
         return MavResult.ACCEPTED if messages else MavResult.FAILED
-
-    def _request_message(self, command: ReceivedCommand) -> int:
-        return self.answer_with(to_int(command.param1), command)
 
     def _set_interval(self, command: ReceivedCommand) -> int:
         message_id = to_int(command.param1)

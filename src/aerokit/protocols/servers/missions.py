@@ -25,21 +25,30 @@ def item_from(message: AnyItem) -> MissionItem:
     return MissionItem(message.command, message.frame, *numbers, autocontinue=bool(message.autocontinue))
 
 
-def item_message_int(
-    item: MissionItem, seq: int, to: ComponentIds, mission_type: int, *, current: bool
-) -> m.MissionItemInt:
-    return to_wire(
-        item, seq, target_system=to.system, target_component=to.component, mission_type=mission_type, current=current
-    )
+def item_message(
+    item: MissionItem,
+    seq: int,
+    to: ComponentIds,
+    mission_type: int,
+    *,
+    as_int: bool,
+    current: bool,
+    place: tuple[float, float] | None = None,
+) -> AnyItem:
+    """Convert an item to a message. ``place`` replaces ``x`` and ``y`` in a MISSION_ITEM (without ``as_int``)."""
+    ids = {"target_system": to.system, "target_component": to.component, "mission_type": mission_type}
+    if as_int:
+        rounded = item.replace(x=round(item.x), y=round(item.y))
+        return to_wire(rounded, seq, **ids, current=current)
+    return to_wire_float(item, seq, **ids, current=current, place=place)
 
 
-def item_message_float(
-    item: MissionItem, place: tuple[float, float], seq: int, to: ComponentIds, mission_type: int, current: int = 0
-) -> m.MissionItem:
-    return to_wire_float(
-        item, seq, target_system=to.system, target_component=to.component, mission_type=mission_type, current=current,
-        place=place,
-    )  # fmt: skip
+class ItemRefused(Exception):
+    """Raised for a mission item that is not stored. ``result`` is the MAV_MISSION_RESULT."""
+
+    def __init__(self, result: int) -> None:
+        super().__init__(f"MAV_MISSION_RESULT {result}")
+        self.result = result
 
 
 MAX_ITEMS = 2000
@@ -109,9 +118,7 @@ class MissionServer:
         self._uploads: dict[int, ListUpload] = {}
         self._clearing: m.MissionClearAll | None = None
         """MISSION_CLEAR_ALL on which ``validate`` has not decided yet."""
-
-    def listen(self) -> None:
-        on = self._host.on
+        on = host.on
         on(m.MissionRequestList, self._on_request_list)
         on(m.MissionRequestInt, self._on_request)
         on(m.MissionRequest, self._on_request)
@@ -137,9 +144,9 @@ class MissionServer:
         if items and mission_type not in self._opaque_ids:
             checksum = 0
             for seq, item in enumerate(items):
-                message = _item_message(item, seq, ComponentIds(), mission_type, current=False)
+                message = item_message(item, seq, ComponentIds(), mission_type, as_int=True, current=False)
                 checksum = zlib.crc32(message.encode(), checksum)
-            self._opaque_ids[mission_type] = checksum or 1  # 0 means no id
+            self._opaque_ids[mission_type] = checksum or 1  # In MAVLink, the opaque id 0 means no id.
         return self._opaque_ids[mission_type] if items else 0
 
     def current_message(self) -> m.MissionCurrent:
@@ -173,25 +180,19 @@ class MissionServer:
         """Return the MAV_MISSION_RESULT that refuses a transfer, or None."""
         return None if message.mission_type in self.lists else _Result.UNSUPPORTED
 
-    def _item(self, mission_type: int, seq: int) -> MissionItem | int:
-        """Return the requested item, or the MAV_MISSION_RESULT that refuses the request."""
+    def item(self, mission_type: int, seq: int) -> MissionItem | None:
         items = self.lists.get(mission_type, ())
-        return items[seq] if 0 <= seq < len(items) else _Result.INVALID_SEQUENCE
+        return items[seq] if 0 <= seq < len(items) else None
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        seq, kind, to = request.seq, request.mission_type, sender_of(request)
+        seq, kind, as_int = request.seq, request.mission_type, isinstance(request, m.MissionRequestInt)
         current = seq == self.current and kind == MavMissionType.MISSION
-        if isinstance(request, m.MissionRequestInt):
-            return _item_message(item, seq, to, kind, current=current)
-        return to_wire_float(
-            item, seq, target_system=to.system, target_component=to.component, mission_type=kind, current=current
-        )
+        return item_message(item, seq, sender_of(request), kind, as_int=as_int, current=current)
 
-    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
-        """Store the expected item of an upload, and return the MAV_MISSION_RESULT."""
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> None:
+        """Store the expected item of an upload. Raises ItemRefused."""
         upload.uses_int = isinstance(message, m.MissionItemInt)
         upload.items.append(from_wire(message))
-        return _Result.ACCEPTED
 
     def _key(self, mission_type: int) -> int:
         """Return the key of an upload. Uploads with different keys can run at the same time."""
@@ -208,12 +209,12 @@ class MissionServer:
             self._host.send(m.MissionCount(*to, self.count(kind), kind, opaque_id=self.opaque_id(kind)), channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
-        refusal = self._refusal(request, channel)
-        item_or_result = self._item(request.mission_type, request.seq) if refusal is None else refusal
-        if isinstance(item_or_result, int):
-            self._refuse_item(request, item_or_result, channel)
+        if (refusal := self._refusal(request, channel)) is not None:
+            self._refuse_item(request, refusal, channel)
+        elif (item := self.item(request.mission_type, request.seq)) is None:
+            self._refuse_item(request, _Result.INVALID_SEQUENCE, channel)
         else:
-            self._host.send(self._message(item_or_result, request), channel)
+            self._host.send(self._message(item, request), channel)
 
     def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(request), request.mission_type, result, channel)
@@ -315,9 +316,10 @@ class MissionServer:
         # Nothing is sent, because an upload requests its expected item again anyway.
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
-        result = self._store_item(upload, message)
-        if result != _Result.ACCEPTED:
-            self._end(upload, result)
+        try:
+            self._store_item(upload, message)
+        except ItemRefused as refused:
+            self._end(upload, refused.result)
             return
         upload.received_at = self._host.now
         upload.next += 1
@@ -392,10 +394,3 @@ class MissionServer:
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         if not self.set_current(request.seq):
             self._host.send(self.current_message(), channel)
-
-
-def _item_message(
-    item: MissionItem, seq: int, to: ComponentIds, mission_type: int, *, current: bool
-) -> m.MissionItemInt:
-    rounded = item.replace(x=round(item.x), y=round(item.y))
-    return item_message_int(rounded, seq, to, mission_type, current=current)

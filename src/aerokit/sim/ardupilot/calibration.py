@@ -160,7 +160,6 @@ class CompassCalibration:
             return None
         self._progress_compass = self._next_compass(self._progress_compass)
         percent = self.percent
-        # The simulation spends half of the time in each of the two steps.
         status = MagCalStatus.RUNNING_STEP_ONE if percent < 50 else MagCalStatus.RUNNING_STEP_TWO
         # The mask of ten bytes has one bit for each of 80 directions in which the vehicle can point.
         direction_count = percent * 80 // 100
@@ -207,10 +206,6 @@ class Calibrations:
         self.compasses: CompassCalibration = CompassCalibration(vehicle)
         self.accelerometers: AccelerometerCalibration = AccelerometerCalibration(vehicle)
         self._simple_calibration_at = -math.inf
-
-    @property
-    def is_compass_running(self) -> bool:
-        return self.compasses.is_running
 
     def reset(self) -> None:
         self.compasses.reset()

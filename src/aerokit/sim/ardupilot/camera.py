@@ -7,6 +7,7 @@ import math
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
 from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.motion import Ned
@@ -26,8 +27,8 @@ class ArduPilotCamera:
     image_count: int
     remaining: int
 
-    def __init__(self, vehicle: ArduPilotHost) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: ArduPilotHost, gimbal: ArduPilotGimbal) -> None:
+        self._vehicle, self._gimbal = vehicle, gimbal
         self.image_count = 0  # Number of images since power-on.
         self.interval_s: float = 0.0  # Seconds between two images of a series.
         self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
@@ -45,13 +46,10 @@ class ArduPilotCamera:
     def is_fitted(self) -> bool:
         return int(self._vehicle.parameters["CAM1_TYPE"]) != 0
 
-    @property
-    def _shutter_s(self) -> float:
-        return self._vehicle.parameters.get("CAM1_DURATION", _DEFAULT_SHUTTER_S)
-
     def take(self) -> bool:
         """Take an image. Return False without a camera, or while its shutter is still open."""
-        if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
+        shutter_s = self._vehicle.parameters.get("CAM1_DURATION", _DEFAULT_SHUTTER_S)
+        if not self.is_fitted or self._vehicle.now - self._taken_at < shutter_s:
             return False
         self.image_count += 1
         self._taken_at = self._vehicle.now
@@ -111,7 +109,7 @@ class ArduPilotCamera:
         return True
 
     def start_capture(self, command: ReceivedCommand) -> int:
-        # Param 1 is the number of the camera. 0 selects all cameras.
+        # Param 1 of IMAGE_START_CAPTURE is the number of the camera. 0 selects all cameras.
         if command.param1 < 0.0:
             return MavResult.UNSUPPORTED
         if command.param1 > 1.0:
@@ -126,7 +124,7 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def digicam_control(self, command: ReceivedCommand | MissionItem) -> int:
-        takes_image = command.x == 1  # Param 5 of the command.
+        takes_image = command.x == 1  # Param 5 of DO_DIGICAM_CONTROL.
         if takes_image:
             self.take()
         return MavResult.ACCEPTED
@@ -177,7 +175,7 @@ class ArduPilotCamera:
             time_boot_ms=self._vehicle.time_boot_ms, vendor_name=bytes(32), model_name=bytes(32), firmware_version=0,
             focal_length=0.0, sensor_size_h=0.0, sensor_size_v=0.0, resolution_h=0, resolution_v=0, lens_id=0, flags=0,
             cam_definition_version=0, cam_definition_uri="",
-            gimbal_device_id=1 if self._vehicle.gimbal.is_fitted else 0,
+            gimbal_device_id=int(self._gimbal.is_fitted),
         )  # fmt: skip
 
     def settings(self) -> m.CameraSettings | None:

@@ -11,8 +11,9 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavDoRepositionFlags, MavFrame, MavMountMode, MavSeverity
 from aerokit.mavlink.enums import MavResult as Result
-from aerokit.protocols.servers.gimbal import angles_and_rates
+from aerokit.protocols.servers.gimbal import Angles, angles_and_rates
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
+from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
@@ -233,14 +234,6 @@ class _CommonCommands:
         return Result.ACCEPTED
 
 
-_FRAMES = frozenset(
-    {
-        MavFrame.GLOBAL, MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT,
-        MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT,
-    }
-)  # fmt: skip
-
-
 class HomeAndOrigin:
     """Handlers of DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
 
@@ -265,7 +258,7 @@ class HomeAndOrigin:
             return Result.FAILED
         # COMMAND_LONG has no frame. The firmware takes the altitude as AMSL.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
-        if frame not in _FRAMES:
+        if frame not in RELATIVE_FRAMES | TERRAIN_FRAMES | ABSOLUTE_FRAMES:
             vehicle.info(f"Unknown mavlink coordinate frame {frame}")
             return Result.DENIED
         point = vehicle.world_point(*command.place(), command.z, frame)
@@ -369,19 +362,16 @@ class GimbalCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        gimbal = self._gimbal(message.gimbal_device_id)
-        angles, rates = angles_and_rates(message)
-        has_both = not any(map(math.isnan, (*angles, *rates)))
-        if gimbal is not None and not has_both:  # The firmware ignores a message with angles and rates.
-            gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
+        self._manage(message, *angles_and_rates(message))
 
     def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        self._manage(message, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
+
+    def _manage(
+        self, message: m.GimbalManagerSetAttitude | m.GimbalManagerSetPitchyaw, angles: Angles, rates: Angles
+    ) -> None:
         gimbal = self._gimbal(message.gimbal_device_id)
-        angles, rates = (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate)
         has_both = not any(map(math.isnan, (*angles, *rates)))
-        if gimbal is not None and not has_both:
-            gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
-
-
-def _degrees(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
-    return (math.degrees(roll), math.degrees(pitch), math.degrees(yaw))
+        if gimbal is not None and not has_both:  # The firmware ignores a message with angles and rates.
+            roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate = map(math.degrees, (*angles, *rates))
+            gimbal.manage(message.flags, (roll, pitch, yaw), (roll_rate, pitch_rate, yaw_rate))

@@ -118,7 +118,7 @@ class CopterFollow(CopterHold):
 
 _LAND_DETECTOR_S = 1.0
 _BASE = int(MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED)
-_GUIDED, _ARMED = int(MavModeFlag.GUIDED_ENABLED), int(MavModeFlag.SAFETY_ARMED)
+_GUIDED = int(MavModeFlag.GUIDED_ENABLED)
 _GUIDED_MODES = frozenset((
     "GUIDED", "GUIDED_NOGPS", "LOITER", "POSHOLD", "CIRCLE", "BRAKE", "RTL", "SMARTRTL", "LAND", "AUTO", "FOLLOW",
     "AVOID_ADSB", "ZIGZAG",
@@ -175,12 +175,15 @@ class SimulatedCopter(CopterHost):
     FIRMWARE: ClassVar[str] = "ArduCopter"
     FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
     MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
+    BASE_FLAGS: ClassVar[int] = _BASE
+    GUIDED_MODES: ClassVar[frozenset[str]] = _GUIDED_MODES
     CAPABILITIES: ClassVar[int] = 0xFBEF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["copter"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
     ARMING: ClassVar[type[ArduPilotArming[Any]]] = CopterArming
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = CopterFailsafes
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = CopterFence
+    SETPOINTS: ClassVar[type[Any]] = CopterSetpoints
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return the handlers of the commands that ArduCopter knows."""
@@ -198,9 +201,6 @@ class SimulatedCopter(CopterHost):
             MavCmd.DO_MOTOR_TEST: lambda command: self.motor_test.command(command),
         }
 
-    def listen_for_setpoints(self) -> None:
-        CopterSetpoints(self)
-
     def reset_controllers(self) -> None:
         super().reset_controllers()
         self._on_ground_timer = ConditionTimer()
@@ -217,17 +217,10 @@ class SimulatedCopter(CopterHost):
 
     @property
     def base_mode(self) -> int:
-        """The field base_mode of HEARTBEAT."""
         if not self.has_left_boot:  # During the boot, GUIDED_ENABLED is set in every mode.
-            return _BASE | _GUIDED
-        flags = _BASE
-        mode_name = self.mode.name
-        is_disarmed_return = mode_name == "RTL" and not self.motors.is_armed
-        if mode_name in _GUIDED_MODES and not is_disarmed_return:
-            flags |= _GUIDED
-        if self.is_armed:  # also during a motor test
-            flags |= _ARMED
-        return flags
+            return self.BASE_FLAGS | _GUIDED
+        is_disarmed_return = self.mode.name == "RTL" and not self.motors.is_armed
+        return super().base_mode & ~_GUIDED if is_disarmed_return else super().base_mode
 
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds, and detect the landing."""

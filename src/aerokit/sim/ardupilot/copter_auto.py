@@ -18,7 +18,7 @@ from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
 from aerokit.sim.ardupilot.host import RC_THROTTLE
-from aerokit.sim.ardupilot.mission_run import MissionCommand, MissionMode, place_of, set_home_from
+from aerokit.sim.ardupilot.mission_run import TAKE_OFFS, MissionCommand, MissionMode, place_of, set_home_from
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
@@ -163,9 +163,8 @@ _NO_STOP_IF_FOLLOWED_BY = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
 )
 _WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_LOITER_TIME})
-_TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
 _LANDINGS = frozenset({Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND})
-_UNTIL_LEG_ENDS = _TAKE_OFFS | {Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT, Cmd.NAV_RETURN_TO_LAUNCH}
+_UNTIL_LEG_ENDS = TAKE_OFFS | {Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT, Cmd.NAV_RETURN_TO_LAUNCH}
 _WITHOUT_EFFECT = (
     Cmd.DO_FENCE_ENABLE, Cmd.DO_WINCH, Cmd.DO_RETURN_PATH_START, Cmd.DO_LAND_START, Cmd.DO_MOUNT_CONTROL,
     Cmd.DO_GUIDED_LIMITS, Cmd.NAV_GUIDED_ENABLE, Cmd.CONDITION_DISTANCE,
@@ -193,7 +192,7 @@ class CopterAuto(MissionMode):
         # The current and the next navigation commands. They are compared to notice an upload that changes them.
         self._upcoming: tuple[MissionCommand, ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            **dict.fromkeys(_TAKE_OFFS, self._take_off),
+            **dict.fromkeys(TAKE_OFFS, self._take_off),
             **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TO_ALT), self._fly),
             **dict.fromkeys(_LANDINGS, self._land),
             Cmd.NAV_LOITER_TURNS: self._circle,
@@ -423,13 +422,13 @@ class CopterAuto(MissionMode):
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
-        if item.param4 > 0:  # The angle is relative. The direction (param 3) is its sign.
+        if item.param4 > 0:  # CONDITION_YAW: relative angle; param 3 is its sign.
             direction = direction or 1
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction)
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
-        if item.param2 <= 0:  # A value of -1 means no change.
+        if item.param2 <= 0:  # In DO_CHANGE_SPEED, -1 means no change.
             return
         if item.param1 == SpeedType.CLIMB_SPEED:
             self.climb = item.param2

@@ -23,7 +23,7 @@ class AutoYaw:
         self._copter = copter
         self._control: Callable[[], None] = self._hold
         """The method that `update` calls at every tick."""
-        self._roi: tuple[float, float] | None = None  # (north, east) of the region of interest
+        self._roi: Ned | None = None  # region of interest
         self._heading = 0.0
         self._rate = 0.0
         """Turn rate (radians per second): set by `turn`, and by `turn_to` for a turn by the longer way; otherwise 0."""
@@ -79,8 +79,7 @@ class AutoYaw:
         if point is None:
             self.apply_default()
         elif not gimbal.is_fitted:
-            north, east, _ = point
-            self._roi = (north, east)
+            self._roi = point
             self._control = self._look_at_roi
 
     def stop_turning(self) -> None:
@@ -112,9 +111,8 @@ class AutoYaw:
 
     def _look_at_roi(self) -> None:
         assert self._roi is not None
-        north, east = self._roi
         motion = self._copter.motion
-        motion.face(math.atan2(east - motion.east, north - motion.north))
+        motion.face(motion.bearing_to(self._roi))
 
 
 class CopterHost(ArduPilotVehicle):
@@ -246,7 +244,7 @@ class CopterPilotedMode(CopterModeBase):
             copter.is_landed = False
         if copter.is_landed:
             return
-        roll, pitch, yaw = ((copter.rc[channel] - _MID_STICK) / _STICK_RANGE for channel in (RC_ROLL, RC_PITCH, RC_YAW))
+        roll, pitch, yaw = map(copter.stick, (RC_ROLL, RC_PITCH, RC_YAW))
         self.fly(roll, pitch, climb)
         copter.motion.turn(yaw * _FULL_STICK_TURN_RAD_S)
 

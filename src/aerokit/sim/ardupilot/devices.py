@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavSeverity, ParachuteAction, WinchActions
 from aerokit.mavlink.enums import MavResult as Result
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming
+from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import ReceivedCommand, constrained, to_int
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import ArduPilotHost
 
 _GRIP_DURATION_S = 0.7
 _WINCH_RATE_M_S, _WINCH_INTERVAL_S = 1.0, 0.1
@@ -20,8 +19,8 @@ _MIN_CHUTE_ALTITUDE_M = 10.0
 class ArduPilotDevices:
     """State of gripper, landing gear, parachute and winch, which a reboot resets."""
 
-    def __init__(self, vehicle: ArduPilotHost) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: ArduPilotHost, arming: ArduPilotArming[Any]) -> None:
+        self._vehicle, self._arming = vehicle, arming
         self.is_gripped: bool = False
         self.gear_is_up: bool = False
         self.chute_is_released: bool = False
@@ -74,7 +73,7 @@ class ArduPilotDevices:
             else:
                 self.chute_is_released = True
                 vehicle.info("Parachute: Released")
-                vehicle.arming.disarm(force=True)
+                self._arming.disarm()
         return Result.ACCEPTED
 
     def move_winch(self, command: ReceivedCommand) -> int:

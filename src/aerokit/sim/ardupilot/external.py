@@ -27,6 +27,11 @@ class ArduPilotExternal:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.reset()
+        for navigation_message in _EXTERNAL_NAVIGATION:
+            vehicle.on(navigation_message, self._on_navigation)
+        for sensor_message in _SENSORS:
+            vehicle.on(sensor_message, self._on_sensor)
+        vehicle.on(m.LandingTarget, self._on_target)
 
     def reset(self) -> None:
         self.latest: dict[type[Message], Message] = {}
@@ -34,14 +39,6 @@ class ArduPilotExternal:
         self._target: tuple[float, float] = (0.0, 0.0)  # (north, east) of the landing target
         # Wind speed in m/s, and the direction in degrees from which the wind comes. The flight is not affected.
         self.wind: tuple[float, float] | None = None
-
-    def listen(self) -> None:
-        vehicle = self._vehicle
-        for navigation_message in _EXTERNAL_NAVIGATION:
-            vehicle.on(navigation_message, self._on_navigation)
-        for sensor_message in _SENSORS:
-            vehicle.on(sensor_message, self._on_sensor)
-        vehicle.on(m.LandingTarget, self._on_target)
 
     @property
     def navigation_age_s(self) -> float:

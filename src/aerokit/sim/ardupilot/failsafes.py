@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from enum import IntFlag
-from typing import ClassVar, Generic
+from typing import Any, ClassVar, Generic
 
 from aerokit.mavlink.enums import GpsFixType, MavSeverity
+from aerokit.sim.ardupilot.calibration import CompassCalibration
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotHost, ConditionTimer, HostT
 
 _OK, _LOW, _CRITICAL = 0, 1, 2
@@ -176,8 +177,9 @@ class ArduPilotArming(Generic[HostT]):
     ARMED_TEXT: ClassVar[str] = "Throttle armed"
     DISARMED_TEXT: ClassVar[str] = "Throttle disarmed"
 
-    def __init__(self, vehicle: HostT) -> None:
+    def __init__(self, vehicle: HostT, failsafes: ArduPilotFailsafes[Any], compasses: CompassCalibration) -> None:
         self.vehicle = vehicle
+        self._failsafes, self._compasses = failsafes, compasses
         self.passes: bool = False  # True if the last pre-arm checks have passed, as SYS_STATUS reports.
         self._reported_at = -math.inf
         self._passed_common = False  # result of the common checks one second ago
@@ -206,14 +208,14 @@ class ArduPilotArming(Generic[HostT]):
     def common_reasons(self) -> list[str]:
         vehicle, check = self.vehicle, ArmingCheck
         reasons = list(vehicle.faults.prearm_failures)
-        if vehicle.calibrations.is_compass_running:
+        if self._compasses.is_running:
             reasons.append("Compass calibration running")
         if self.is_checked(check.INS):
             reasons += self.ahrs_reasons()
         reasons += self.position_reasons()
         if self.is_checked(check.BATTERY):
-            reasons += _listed(vehicle.failsafes.battery.reason_not_to_arm())
-        if self.is_checked(check.RC) and vehicle.failsafes.is_radio_lost:
+            reasons += _listed(self._failsafes.battery.reason_not_to_arm())
+        if self.is_checked(check.RC) and self._failsafes.is_radio_lost:
             reasons.append("Radio failsafe on")
         if self.is_checked(check.MISSION) and vehicle.mode.needs_mission and not vehicle.mission.is_present:
             reasons.append("Mode requires mission")
@@ -322,9 +324,7 @@ class ArduPilotArming(Generic[HostT]):
     def on_armed(self) -> None: ...
 
     def _reasons_not_to_arm(self, *, force: bool) -> list[str]:
-        if not self.vehicle.is_initialised:
-            return ["System not initialised"]
-        if force:
+        if force and self.vehicle.is_initialised:
             return self.mandatory_reasons()
         return self.reasons() or self.final_reasons()
 

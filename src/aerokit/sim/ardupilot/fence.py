@@ -13,11 +13,14 @@ from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.missions import FenceZones
 from aerokit.sim.motion import Ned
 
-# Bits of FENCE_TYPE.
 _MAX_ALT, _CIRCLE = int(FenceType.ALT_MAX), int(FenceType.CIRCLE)
 _POLYGON, _MIN_ALT = int(FenceType.POLYGON), int(FenceType.ALT_MIN)
 _NAMES = {_MAX_ALT: "Max Alt", _CIRCLE: "Circle", _POLYGON: "Polygon", _MIN_ALT: "Min Alt"}
 _ALL = _MAX_ALT | _CIRCLE | _POLYGON | _MIN_ALT
+# FENCE_STATUS reports the first of these breaches that exists.
+_BREACHES = (
+    (_CIRCLE | _POLYGON, FenceBreach.BOUNDARY), (_MAX_ALT, FenceBreach.MAXALT), (_MIN_ALT, FenceBreach.MINALT),
+)  # fmt: skip
 # Metres by which a breach must grow to count as a new breach.
 _BACKUP_M = 20.0
 _RECOVERY_DURATION_S = 10.0
@@ -69,7 +72,6 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def present(self) -> int:
-        # The kind POLYGON is present only while zones are stored.
         return self.configured if self.zones else self.configured & ~_POLYGON
 
     @property
@@ -303,13 +305,7 @@ class ArduPilotFence(Generic[HostT]):
     def status(self) -> m.FenceStatus | None:
         if not self.enabled:
             return None
-        breach = FenceBreach.NONE
-        if self.breached & (_CIRCLE | _POLYGON):
-            breach = FenceBreach.BOUNDARY
-        elif self.breached & _MAX_ALT:
-            breach = FenceBreach.MAXALT
-        elif self.breached & _MIN_ALT:
-            breach = FenceBreach.MINALT
+        breach = next((reason for kinds, reason in _BREACHES if self.breached & kinds), FenceBreach.NONE)
         is_breached = int(self.breached != 0)
         return m.FenceStatus(is_breached, self.breach_count, breach, self.breach_time_ms, self.MITIGATION)
 

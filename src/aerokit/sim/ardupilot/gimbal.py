@@ -129,9 +129,6 @@ class ArduPilotGimbal:
             return target.yaw
         return math.remainder(target.yaw - math.degrees(self._vehicle.motion.yaw), 360.0)
 
-    def _from_north(self, target: MountTarget) -> float:
-        return target.yaw if target.is_from_north else target.yaw + math.degrees(self._vehicle.motion.yaw)
-
     def _limited(self, axis: str, angle: float) -> float:
         return max(self.setting(f"MNT1_{axis}_MIN"), min(self.setting(f"MNT1_{axis}_MAX"), angle))
 
@@ -154,7 +151,9 @@ class ArduPilotGimbal:
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
         """Turn at rates in degrees per second. With ``from_north``, yaw is relative to north, otherwise to the nose."""
         current = self.target
-        current_yaw = self._from_north(current) if from_north else self._from_nose(current)
+        current_yaw = self._from_nose(current)
+        if from_north:
+            current_yaw = current.yaw if current.is_from_north else current.yaw + math.degrees(self._vehicle.motion.yaw)
         rates = (roll, pitch, yaw)
         self._target = MountTarget(current.roll, current.pitch, current_yaw, from_north, rates, self._vehicle.now)
         self.mode = MavMountMode.MAVLINK_TARGETING

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavSeverity
-from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import BootTimeline, Kind
 from aerokit.sim.ardupilot.mission_lists import CommandList
 from aerokit.sim.autopilot import SimulatedAutopilot
@@ -199,11 +198,6 @@ class ArduPilotMotors:
 # The following classes are the interfaces through which the parts of a vehicle use each other.
 
 
-class ArduPilotExternalHost(Protocol):
-    @property
-    def navigation_age_s(self) -> float: ...
-
-
 class ArduPilotNavigationHost(Protocol):
     home: Ned | None
     home_is_locked: bool
@@ -222,10 +216,6 @@ class ArduPilotNavigationHost(Protocol):
     def altitude_above_home(self) -> float: ...
     def set_home(self, point: Ned, *, lock: bool) -> None: ...
     def world(self, local: Ned) -> Ned: ...
-
-
-class ArduPilotArmingHost(Protocol):
-    def disarm(self, *, force: bool = True) -> bool: ...
 
 
 class ArduPilotMissionHost(Protocol):
@@ -252,16 +242,8 @@ class ArduPilotRadioHost(Protocol):
     def override(self, pulses: Mapping[int, int]) -> None: ...
 
 
-class ArduPilotBatteryHost(Protocol):
-    def reason_not_to_arm(self) -> str | None: ...
-
-
 class ArduPilotFailsafesHost(Protocol):
     ground_station_seen_at: float
-    is_radio_lost: bool
-
-    @property
-    def battery(self) -> ArduPilotBatteryHost: ...
 
 
 class ArduPilotFenceHost(Protocol):
@@ -271,23 +253,9 @@ class ArduPilotFenceHost(Protocol):
     def reason_not_to_arm(self) -> str | None: ...
 
 
-class ArduPilotCameraHost(Protocol):
-    def run(self, item: MissionItem) -> None: ...
-
-
-class ArduPilotGimbalHost(Protocol):
-    @property
-    def is_fitted(self) -> bool: ...
-
-
-class ArduPilotCalibrationsHost(Protocol):
-    @property
-    def is_compass_running(self) -> bool: ...
-
-
-_RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
-_TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
-_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
+RELATIVE_FRAMES = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
+TERRAIN_FRAMES = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
+ABSOLUTE_FRAMES = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class ArduPilotHost(SimulatedAutopilot):
@@ -308,16 +276,11 @@ class ArduPilotHost(SimulatedAutopilot):
     is_initialised: bool
     is_landed: bool
     navigation: ArduPilotNavigationHost
-    arming: ArduPilotArmingHost
     mission: ArduPilotMissionHost
     missions: ArduPilotMissionsHost
     failsafes: ArduPilotFailsafesHost
     fence: ArduPilotFenceHost
-    camera: ArduPilotCameraHost
-    gimbal: ArduPilotGimbalHost
     rc: ArduPilotRadioHost
-    external: ArduPilotExternalHost
-    calibrations: ArduPilotCalibrationsHost
 
     @property
     def guided(self) -> ArduPilotMode:
@@ -342,9 +305,6 @@ class ArduPilotHost(SimulatedAutopilot):
         raise NotImplementedError
 
     def available_modes(self) -> list[m.AvailableModes]:
-        raise NotImplementedError
-
-    def announce_parameter(self, name: str) -> None:
         raise NotImplementedError
 
     def send_home(self, channel: Channel | None = None) -> None:
@@ -379,12 +339,12 @@ class ArduPilotHost(SimulatedAutopilot):
         if not is_place or not math.isfinite(altitude):
             return None
         north, east = self.frame.to_local(latitude_e7, longitude_e7)
-        if frame in _RELATIVE:
+        if frame in RELATIVE_FRAMES:
             _, _, home_down = self.home_or_ground
             return (north, east, home_down - altitude)
-        if frame in _TERRAIN:
+        if frame in TERRAIN_FRAMES:
             return (north, east, self.motion.ground_down - altitude)
-        if frame in _ABSOLUTE:
+        if frame in ABSOLUTE_FRAMES:
             return (north, east, self.frame.origin.altitude_m - altitude)
         self.info(f"Unknown mavlink coordinate frame {frame}")
         return None

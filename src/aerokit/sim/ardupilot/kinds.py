@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-import pkgutil
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Literal
 
 from aerokit.sim.parameters import SimParameters
@@ -18,7 +18,7 @@ KINDS: tuple[Kind, ...] = ("copter", "plane", "rover", "sub")
 
 def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
     """Return the parameters of a firmware. ``count`` limits how many are listed."""
-    return SimParameters.from_text(_read(f"{kind}.param.csv"), count)
+    return SimParameters(_read(f"{kind}.param.csv"), count)
 
 
 def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:
@@ -31,9 +31,7 @@ def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:
 
 @functools.cache
 def _read(file: str) -> str:
-    data = pkgutil.get_data(__name__, file)
-    assert data is not None
-    return data.decode()
+    return Path(__file__).with_name(file).read_text("utf-8")
 
 
 @dataclass(frozen=True)

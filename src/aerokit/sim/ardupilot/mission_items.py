@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import csv
 import math
-import pkgutil
 import struct
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
+from aerokit.protocols.servers.missions import ItemRefused
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
@@ -47,11 +48,10 @@ class StoredCommand(NamedTuple):
 
 
 def _read_commands() -> dict[int, StoredCommand]:
-    data = pkgutil.get_data(__name__, "mission_commands.csv")
-    assert data is not None
+    text = Path(__file__).with_name("mission_commands.csv").read_text("utf-8")
     return {
         Cmd[row["command"]]: StoredCommand(row["name"], row["parameters"], row["has_place"] == "1")
-        for row in csv.DictReader(data.decode().splitlines())
+        for row in csv.DictReader(text.splitlines())
     }
 
 
@@ -80,33 +80,33 @@ def has_location(command: int) -> bool:
     return STORED_COMMANDS.get(command, _UNKNOWN).has_place
 
 
-def check_place(latitude_e7: float, longitude_e7: float) -> int:
-    """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate."""
-    # Like the firmware, compare in single precision.
-    if not abs(float32(latitude_e7)) <= 900_000_000:  # `not <=` also refuses NaN.
-        return MavMissionResult.INVALID_PARAM5_X
-    in_range = abs(float32(longitude_e7)) <= 1_800_000_000
-    return MavMissionResult.ACCEPTED if in_range else MavMissionResult.INVALID_PARAM6_Y
+def check_place(latitude_e7: float, longitude_e7: float) -> None:
+    """Raise ItemRefused for a coordinate that is out of range."""
+    # Like the firmware, compare in single precision. `not <=` also refuses NaN.
+    if not abs(float32(latitude_e7)) <= 900_000_000:
+        raise ItemRefused(MavMissionResult.INVALID_PARAM5_X)
+    if not abs(float32(longitude_e7)) <= 1_800_000_000:
+        raise ItemRefused(MavMissionResult.INVALID_PARAM6_Y)
 
 
-def altitude_frame(frame: int) -> int | None:
-    """Return the downloaded MAV_FRAME of an item that was uploaded with ``frame``. None if the frame is refused."""
-    return _DOWNLOADED_FRAMES.get(frame)
+def altitude_frame(frame: int) -> int:
+    """Return the downloaded MAV_FRAME of an item that was uploaded with ``frame``. Raises ItemRefused."""
+    if frame not in _DOWNLOADED_FRAMES:
+        raise ItemRefused(MavMissionResult.UNSUPPORTED_FRAME)
+    return _DOWNLOADED_FRAMES[frame]
 
 
-def as_stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
-    """Return the uploaded item as a later download contains it, or the MAV_MISSION_RESULT that refuses the upload."""
-    result = _check_numbers(item)
-    if result != MavMissionResult.ACCEPTED:
-        return result
+def as_stored(item: MissionItem, kind: Kind) -> MissionItem:
+    """Return the uploaded item as a later download contains it. Raises ItemRefused."""
+    _check_numbers(item)
     if item.command in (0, 1):  # The storage format reserves these command ids (AP_Mission.cpp).
-        return MavMissionResult.INVALID
+        raise ItemRefused(MavMissionResult.INVALID)
     # The layout has one letter for each stored param. It is empty for an unsupported command.
     layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters
     if kind == "plane":
         layout = _PLANE_PARAMETERS.get(item.command, layout)
     if not layout:
-        return MavMissionResult.UNSUPPORTED
+        raise ItemRefused(MavMissionResult.UNSUPPORTED)
     values = (item.param1, item.param2, item.param3, item.param4, float(item.x), float(item.y), item.z)
     types = layout.ljust(len(values), _NOT_STORED)
     stored_values = [_CONVERSIONS[type_](value) for type_, value in zip(types, values, strict=True)]
@@ -115,31 +115,23 @@ def as_stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     p1, p2, p3, p4, x, y, z = stored_values
     frame: int = MavFrame.GLOBAL  # The frame that a download reports for an item without a position.
     if has_location(item.command):
-        place_or_result = _stored_place(item)
-        if isinstance(place_or_result, int):  # The item is refused with this MAV_MISSION_RESULT.
-            return place_or_result
-        x, y, z, frame = place_or_result
+        x, y, z, frame = _stored_place(item)
     return MissionItem(item.command, frame, p1, p2, p3, p4, int(x), int(y), z)
 
 
-def _check_numbers(item: MissionItem) -> int:
+def _check_numbers(item: MissionItem) -> None:
     may_be_nan = _NAN_ALLOWED.get(item.command, ())
     for index, value in enumerate((item.param1, item.param2, item.param3, item.param4)):
         if math.isinf(value) or (math.isnan(value) and index not in may_be_nan):
-            return MavMissionResult.INVALID_PARAM1 + index
-    return MavMissionResult.ACCEPTED
+            raise ItemRefused(MavMissionResult.INVALID_PARAM1 + index)
 
 
-def _stored_place(item: MissionItem) -> tuple[float, float, float, int] | int:
-    """Return x, y, z and frame of a position as stored, or the MAV_MISSION_RESULT of a refusal."""
-    result = check_place(item.x, item.y)
-    if result != MavMissionResult.ACCEPTED:
-        return result
+def _stored_place(item: MissionItem) -> tuple[float, float, float, int]:
+    """Return x, y, z and frame of a position as stored."""
+    check_place(item.x, item.y)
     if not abs(item.z) < _MAX_ALTITUDE_M:
-        return MavMissionResult.INVALID_PARAM7
+        raise ItemRefused(MavMissionResult.INVALID_PARAM7)
     frame = altitude_frame(item.frame)
-    if frame is None:
-        return MavMissionResult.UNSUPPORTED_FRAME
     # The firmware stores whole centimetres, and calculates in single precision.
     centimetres = int(float32(float32(item.z) * 100.0))
     return item.x, item.y, float32(centimetres * float32(0.01)), frame

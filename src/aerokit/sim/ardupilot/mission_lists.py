@@ -12,6 +12,7 @@ from typing import ClassVar
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
+from aerokit.protocols.servers.missions import ItemRefused
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.mission_items import altitude_frame, as_stored, check_place
 from aerokit.sim.commands import to_int
@@ -22,7 +23,7 @@ _HOME_SEQ = 0
 
 
 class ItemList:
-    """Base of the lists of mission, fence and rally items. `put` and `finish` return a MAV_MISSION_RESULT."""
+    """Base of the lists of mission, fence and rally items. `put` and `finish` raise ItemRefused."""
 
     name: ClassVar[str]
     """Name of the list in status texts."""
@@ -35,11 +36,10 @@ class ItemList:
         raise NotImplementedError
 
     def items(self) -> list[MissionItem]:
-        items_or_results = [self.item(seq) for seq in range(self.count)]
-        return [item for item in items_or_results if not isinstance(item, int)]
+        items = map(self.item, range(self.count))
+        return [item for item in items if item is not None]
 
-    def item(self, seq: int) -> MissionItem | int:
-        """Return the item with this index, or the MAV_MISSION_RESULT for a missing item."""
+    def item(self, seq: int) -> MissionItem | None:
         raise NotImplementedError
 
     def begin(self, count: int) -> None:
@@ -48,13 +48,12 @@ class ItemList:
     def begin_update(self) -> None:
         """Start a partial upload."""
 
-    def put(self, seq: int, item: MissionItem, last: int) -> int:
+    def put(self, seq: int, item: MissionItem, last: int) -> None:
         """Store an uploaded item. ``last`` is the upload's last sequence number."""
         raise NotImplementedError
 
-    def finish(self, warn: Callable[[str], None]) -> int:
+    def finish(self, warn: Callable[[str], None]) -> None:
         """Complete an upload. ``warn`` sends a status text."""
-        return MavMissionResult.ACCEPTED
 
     def abandon(self) -> None: ...
 
@@ -69,7 +68,7 @@ class CommandList(ItemList):
     name = "Mission"
 
     def __init__(
-        self, capacity: int, home: Callable[[], MissionItem], is_running: Callable[[], bool], kind: Kind = "copter"
+        self, capacity: int, home: Callable[[], MissionItem], is_running: Callable[[], bool], kind: Kind
     ) -> None:
         super().__init__(capacity)
         self._kind: Kind = kind
@@ -82,10 +81,8 @@ class CommandList(ItemList):
     def count(self) -> int:
         return len(self._commands)
 
-    def item(self, seq: int) -> MissionItem | int:
-        if seq == 0:  # Home can be read even if there is no mission.
-            return self._home()
-        return self._commands[seq] if seq < len(self._commands) else MavMissionResult.INVALID_SEQUENCE
+    def item(self, seq: int) -> MissionItem | None:
+        return self._home() if seq == 0 else self.command(seq)  # Home can be read even if there is no mission.
 
     def command(self, index: int) -> MissionItem | None:
         return self._commands[index] if 0 < index < len(self._commands) else None
@@ -99,23 +96,19 @@ class CommandList(ItemList):
         del self._commands[count:]
         self.version += 1
 
-    def put(self, seq: int, item: MissionItem, last: int) -> int:
+    def put(self, seq: int, item: MissionItem, last: int) -> None:
         stored_item = as_stored(item, self._kind)
-        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-            return stored_item
-        if stored_item.command == Cmd.DO_JUMP and not self._is_jump_target(stored_item.param1, last):
-            return MavMissionResult.ERROR
-        return self._write(seq, stored_item)
+        target = stored_item.param1
+        if stored_item.command == Cmd.DO_JUMP and (target == 0 or target > max(last, self.count - 1)):
+            raise ItemRefused(MavMissionResult.ERROR)
+        self._write(seq, stored_item)
 
-    def _is_jump_target(self, target: float, last: int) -> bool:
-        return target != 0 and (target < self.count or target <= last)
-
-    def _write(self, seq: int, stored_item: MissionItem) -> int:
+    def _write(self, seq: int, stored_item: MissionItem) -> None:
         count = len(self._commands)
         has_space_beyond_home = self.capacity > 1  # Without it, even the upload of home (item 0) is refused.
         has_space = has_space_beyond_home and seq < self.capacity
         if seq > count or not has_space:
-            return MavMissionResult.ERROR
+            raise ItemRefused(MavMissionResult.ERROR)
         if seq == count:
             # If the list is empty, the firmware adds home first, so this item becomes item 1 (AP_Mission.cpp, add_cmd).
             self.add_home()
@@ -123,7 +116,6 @@ class CommandList(ItemList):
         elif seq != _HOME_SEQ:  # Item 0 is home, which is not stored.
             self._commands[seq] = stored_item
         self.version += 1
-        return MavMissionResult.ACCEPTED
 
     def clear(self) -> bool:
         if self._is_running():
@@ -131,20 +123,15 @@ class CommandList(ItemList):
         self.begin(0)
         return True
 
-    def write_file(self, items: list[MissionItem], start: int) -> int:
-        """Store the items of an uploaded file. Stop at the first refused item."""
-        for seq, item in enumerate(items):
+    def write_file(self, items: Sequence[MissionItem], start: int) -> None:
+        """Store the items of an uploaded file, up to the first refused item."""
+        for seq, item in enumerate(items, start):
             stored_item = as_stored(item, self._kind)
-            if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-                return stored_item
             # The firmware checks the jump target against the length of the file, even if `start` is not 0
             # (AP_Filesystem_Mission.cpp, finish_upload_mission).
             if stored_item.command == Cmd.DO_JUMP and not 0 < stored_item.param1 < len(items):
-                return MavMissionResult.ERROR
-            result = self._write(seq + start, stored_item)
-            if result != MavMissionResult.ACCEPTED:
-                return result
-        return MavMissionResult.ACCEPTED
+                raise ItemRefused(MavMissionResult.ERROR)
+            self._write(seq, stored_item)
 
 
 class RallyList(ItemList):
@@ -160,43 +147,41 @@ class RallyList(ItemList):
     def count(self) -> int:
         return len(self._points)
 
-    def item(self, seq: int) -> MissionItem | int:
-        if seq >= len(self._points):
-            return MavMissionResult.INVALID_SEQUENCE
-        point = self._points[seq]
-        # A point at latitude 0 and longitude 0 counts as missing.
-        return MavMissionResult.INVALID_SEQUENCE if (point.x, point.y) == (0, 0) else point
+    def item(self, seq: int) -> MissionItem | None:
+        point = self._points[seq] if seq < len(self._points) else None
+        # A rally point at latitude 0 and longitude 0 counts as missing.
+        return None if point is None or (point.x, point.y) == (0, 0) else point
 
     def begin(self, count: int) -> None:
         del self._points[count:]
 
-    def put(self, seq: int, item: MissionItem, last: int) -> int:
+    def put(self, seq: int, item: MissionItem, last: int) -> None:
         stored_item = _stored_rally_point(item)
-        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-            return stored_item
         if seq > len(self._points) or seq >= self.capacity:
-            return MavMissionResult.ERROR
+            raise ItemRefused(MavMissionResult.ERROR)
         self._points[seq : seq + 1] = [stored_item]  # replaces the point, or appends it at the end
-        return MavMissionResult.ACCEPTED
 
     def clear(self) -> bool:
         self._points.clear()
         return True
 
 
-def _stored_rally_point(item: MissionItem) -> MissionItem | int:
+def _stored_rally_point(item: MissionItem) -> MissionItem:
     if item.command != Cmd.NAV_RALLY_POINT:
-        return MavMissionResult.UNSUPPORTED
-    result = check_place(item.x, item.y)
-    if result != MavMissionResult.ACCEPTED:
-        return result
+        raise ItemRefused(MavMissionResult.UNSUPPORTED)
+    check_place(item.x, item.y)
     if not _MIN_RALLY_M <= item.z <= _MAX_RALLY_M:  # The altitude is stored in whole metres, as an int16.
-        return MavMissionResult.INVALID_PARAM7
-    frame = altitude_frame(item.frame)
-    if frame is None or item.frame == MavFrame.MISSION:
-        return MavMissionResult.UNSUPPORTED_FRAME
+        raise ItemRefused(MavMissionResult.INVALID_PARAM7)
+    frame = _global_frame(item)
     height = float32(int(item.z))
     return MissionItem(item.command, frame, x=int(item.x), y=int(item.y), z=height, autocontinue=False)
+
+
+def _global_frame(item: MissionItem) -> int:
+    """Return the frame with which an item is downloaded. Without a global frame, the item is refused."""
+    if item.frame == MavFrame.MISSION:
+        raise ItemRefused(MavMissionResult.UNSUPPORTED_FRAME)
+    return altitude_frame(item.frame)
 
 
 _TYPE_NUMBERS: dict[int, int] = {
@@ -234,8 +219,8 @@ class FenceList(ItemList):
     def items(self) -> list[MissionItem]:
         return list(self._stored)
 
-    def item(self, seq: int) -> MissionItem | int:
-        return self._stored[seq] if seq < len(self._stored) else MavMissionResult.INVALID_SEQUENCE
+    def item(self, seq: int) -> MissionItem | None:
+        return self._stored[seq] if seq < len(self._stored) else None
 
     def begin(self, count: int) -> None:
         self._uploaded = [None for _ in range(count)]
@@ -243,19 +228,15 @@ class FenceList(ItemList):
     def begin_update(self) -> None:
         self._uploaded = list(self._stored)
 
-    def put(self, seq: int, item: MissionItem, last: int) -> int:
+    def put(self, seq: int, item: MissionItem, last: int) -> None:
         assert self._uploaded is not None  # `begin` has created the list with the announced number of items.
         if seq >= len(self._uploaded):
-            return MavMissionResult.INVALID_SEQUENCE
-        stored_item = _stored_fence_item(item)
-        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-            return stored_item
-        self._uploaded[seq] = stored_item
-        return MavMissionResult.ACCEPTED
+            raise ItemRefused(MavMissionResult.INVALID_SEQUENCE)
+        self._uploaded[seq] = _stored_fence_item(item)
 
-    def finish(self, warn: Warn) -> int:
+    def finish(self, warn: Warn) -> None:
         assert self._uploaded is not None
-        return self.store([item for item in self._uploaded if item is not None], warn)
+        self._check_and_store([item for item in self._uploaded if item is not None], warn)
 
     def abandon(self) -> None:
         self._uploaded = None
@@ -270,41 +251,33 @@ class FenceList(ItemList):
         zone_points = sum(item.command != Cmd.NAV_FENCE_RETURN_POINT for item in items)
         self._on_total(zone_points + 2 if zone_points >= 3 else 0)
 
-    def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
+    def _check_and_store(self, items: Sequence[MissionItem], warn: Warn) -> None:
         """Store a fence, or ``warn`` if it is invalid or too large."""
         problem = _fence_problem(items)
         if problem is not None:
             warn(problem)
             warn("Fence validation failed")
-            return MavMissionResult.ERROR
+            raise ItemRefused(MavMissionResult.ERROR)
         if _storage_needed(items) > _STORAGE_BYTES:
             warn("Fence exceeds storage size")
-            return MavMissionResult.ERROR
+            raise ItemRefused(MavMissionResult.ERROR)
         self._store(items)
-        return MavMissionResult.ACCEPTED
 
-    def replace(self, items: Sequence[MissionItem], warn: Warn) -> int:
-        stored_items: list[MissionItem] = []
-        for item in items:
-            stored_item = _stored_fence_item(item)
-            if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-                return stored_item
-            stored_items.append(stored_item)
-        return self.store(stored_items, warn)
+    def replace(self, items: Sequence[MissionItem], warn: Warn) -> None:
+        self._check_and_store([_stored_fence_item(item) for item in items], warn)
 
 
-def _stored_fence_item(item: MissionItem) -> MissionItem | int:
-    if item.frame == MavFrame.MISSION or altitude_frame(item.frame) is None:
-        return MavMissionResult.UNSUPPORTED_FRAME
+def _stored_fence_item(item: MissionItem) -> MissionItem:
+    _global_frame(item)
     size = 0.0
     if item.command in POLYGON_CORNERS:
         if item.param1 > _MAX_VERTICES:
-            return MavMissionResult.INVALID_PARAM1
+            raise ItemRefused(MavMissionResult.INVALID_PARAM1)
         size = float(to_int(item.param1) & 0xFF)  # The number of vertices is stored in one byte.
     elif item.command in CIRCLES:
         size = float32(item.param1)
     elif item.command != Cmd.NAV_FENCE_RETURN_POINT:
-        return MavMissionResult.UNSUPPORTED
+        raise ItemRefused(MavMissionResult.UNSUPPORTED)
     return MissionItem(item.command, MavFrame.GLOBAL, size, x=int(item.x), y=int(item.y), z=0.0, autocontinue=False)
 
 
@@ -335,7 +308,9 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
             if has_return_point:
                 return "Multiple return points"
             has_return_point = True
-        if check_place(item.x, item.y) != MavMissionResult.ACCEPTED:
+        try:
+            check_place(item.x, item.y)
+        except ItemRefused:
             return "Bad lat or lon"
     return "Incorrect item count" if missing else None
 

@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavSeverity, MissionState
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.camera import ArduPilotCamera
 from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode
 from aerokit.sim.ardupilot.mission_items import command_name
 from aerokit.sim.motion import Ned
@@ -21,7 +22,7 @@ _FIRST = 1
 _MAX_JUMPS, _MAX_STEPS, _MAX_LOOK_AHEAD = 64, 255, 16
 _UNLIMITED = -1
 _WITH_TARGET = frozenset({Cmd.DO_JUMP, Cmd.JUMP_TAG, Cmd.DO_JUMP_TAG})
-_TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
+TAKE_OFFS = frozenset({Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF})
 _BEFORE_TAKE_OFF = frozenset({Cmd.DO_AUX_FUNCTION, Cmd.NAV_DELAY})
 # Navigation commands with a number above NAV_LAST.
 _NAVIGATION_ABOVE_LAST = frozenset({Cmd.NAV_SET_YAW_SPEED, Cmd.NAV_SCRIPT_TIME, Cmd.NAV_ATTITUDE_TIME})
@@ -115,8 +116,8 @@ def is_navigation(item: MissionItem) -> bool:
 class MissionRun:
     """Progress in the mission. The first command has the index 1. The index 0 (home) means that there is no command."""
 
-    def __init__(self, vehicle: ArduPilotHost, mode: MissionMode) -> None:
-        self._vehicle, self._mode = vehicle, mode
+    def __init__(self, vehicle: ArduPilotHost, mode: MissionMode, camera: ArduPilotCamera) -> None:
+        self._vehicle, self._mode, self._camera = vehicle, mode, camera
         self._list = vehicle.missions.commands
         self._state = MissionState.NOT_STARTED
         self.nav_index: int = 0  # Index of the navigation command that runs or will be resumed.
@@ -162,7 +163,7 @@ class MissionRun:
         """Return True if the first navigation command from ``index`` on is a take-off. Delays are skipped."""
         for _, item in self.navigation_from(index):
             if item.command not in _BEFORE_TAKE_OFF:
-                return item.command in _TAKE_OFFS
+                return item.command in TAKE_OFFS
         return False
 
     def navigation_from(self, index: int) -> Iterator[MissionCommand]:
@@ -319,7 +320,7 @@ class MissionRun:
         name = command_name(item.command)
         target = f" {item.param1:.0f}" if item.command in _WITH_TARGET else ""
         self._vehicle.info(f"Mission: {index} {name}{target}")
-        self._vehicle.camera.run(item)
+        self._camera.run(item)
         return item.command in _INSTANT or self._mode.start_command(item)
 
     def _is_complete(self, index: int, item: MissionItem) -> bool:

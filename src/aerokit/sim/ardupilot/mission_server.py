@@ -19,11 +19,11 @@ from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
     AnyRequest,
+    ItemRefused,
     ListUpload,
     MissionServer,
     item_from,
-    item_message_float,
-    item_message_int,
+    item_message,
 )
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.mission_items import as_stored, has_location
@@ -64,10 +64,7 @@ class ArduPilotMissionServer(MissionServer):
         }
         # (message type, list type) of the warnings that were sent.
         self._warnings: set[tuple[type[Message], int]] = set()
-
-    def listen(self) -> None:
-        super().listen()
-        self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
+        vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
 
     def reset(self) -> None:
         super().reset()
@@ -78,20 +75,21 @@ class ArduPilotMissionServer(MissionServer):
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        if mission_type == MavMissionType.MISSION:
+        if mission_type != MavMissionType.MISSION and not clear:
+            return Result.ERROR  # A fence and rally points are always replaced as a whole.
+        try:
+            if mission_type == MavMissionType.FENCE:
+                self.fence.replace(items, self._warn)
+                return Result.ACCEPTED
             if clear:  # The firmware writes the items even if a running mission prevents the clearing.
-                self._clear_list(self.commands)
-            return self.commands.write_file(list(items), start)
-        # A fence and rally points are always replaced as a whole.
-        if not clear:
-            return Result.ERROR
-        if mission_type == MavMissionType.FENCE:
-            return self.fence.replace(items, self._warn)
-        self.rally.clear()
-        for seq, item in enumerate(items):
-            result = self.rally.put(seq, item, len(items) - 1)
-            if result != Result.ACCEPTED:
-                return result
+                self._clear_list(self._lists[mission_type])
+            if mission_type == MavMissionType.MISSION:
+                self.commands.write_file(items, start)
+            else:
+                for seq, item in enumerate(items):
+                    self.rally.put(seq, item, len(items) - 1)
+        except ItemRefused as refused:
+            return refused.result
         return Result.ACCEPTED
 
     def _home(self) -> MissionItem:
@@ -105,7 +103,7 @@ class ArduPilotMissionServer(MissionServer):
     def _warn(self, text: str) -> None:
         self._vehicle.send_text(MavSeverity.WARNING, text)
 
-    def _warn_once(self, message: AnyItem | m.MissionRequest, text: str) -> None:
+    def _warn_once(self, message: AnyItem | AnyRequest, text: str) -> None:
         """Warn about the class of ``message``, at most once in a transfer."""
         warning = (type(message), message.mission_type)
         if warning not in self._warnings:
@@ -151,22 +149,21 @@ class ArduPilotMissionServer(MissionServer):
             self._vehicle.send(m.MissionCount(*sender_of(request), self.count(kind), kind), channel)
         super()._refuse_item(request, result, channel)
 
-    def _item(self, mission_type: int, seq: int) -> MissionItem | int:
+    def item(self, mission_type: int, seq: int) -> MissionItem | None:
         return self._lists[mission_type].item(seq)
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        client, kind = sender_of(request), request.mission_type
+        client, kind, as_int = sender_of(request), request.mission_type, isinstance(request, m.MissionRequestInt)
         # The firmware has a bug: it compares the command of the item, not its index, with the index of the current
         # item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
-        if isinstance(request, m.MissionRequestInt):
-            return item_message_int(item, request.seq, client, kind, current=current)
         place: tuple[float, float] = (item.x, item.y)
         if has_location(item.command):
             # The position in degrees, converted in single precision like in the firmware.
             place = (float32(item.x * float32(1e-7)), float32(item.y * float32(1e-7)))
-        self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
-        return item_message_float(item, place, request.seq, client, kind, int(current))
+        if not as_int:
+            self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
+        return item_message(item, request.seq, client, kind, as_int=as_int, current=current, place=place)
 
     def _refuse_size(self, message: m.MissionCount, channel: Channel) -> None:
         super()._refuse_size(message, channel)
@@ -209,30 +206,36 @@ class ArduPilotMissionServer(MissionServer):
         super()._time_out(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        item = _with_integer_position(message)
         kind = message.mission_type
-        if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
-            self._answer_item(message, item, channel)
-        elif kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE):
-            result = self._guide(item, message.current)  # The item is a target, and is not stored in a list.
-            self._answer_item(message, result, channel)
-        elif kind not in self._lists:
-            self._answer_item(message, Result.UNSUPPORTED, channel)
-        else:
-            if isinstance(message, m.MissionItem) and kind in self._uploads:
-                self._warn_once(message, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
-            super()._on_item(message, channel)
+        is_target = kind == MavMissionType.MISSION and message.current in (_GUIDED_TARGET, _ALTITUDE_CHANGE)
+        try:
+            item = _with_integer_position(message)
+            if is_target:  # The item is flown to, and not stored in a list.
+                self._guide(item, message.current)
+            elif kind not in self._lists:
+                raise ItemRefused(Result.UNSUPPORTED)
+        except ItemRefused as refused:
+            self._answer_item(message, refused.result, channel)
+            return
+        if is_target:
+            self._answer_item(message, Result.ACCEPTED, channel)
+            return
+        if isinstance(message, m.MissionItem) and kind in self._uploads:
+            self._warn_once(message, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
+        super()._on_item(message, channel)
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(message), message.mission_type, result, channel)
 
-    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
-        item = _with_integer_position(message)
-        assert not isinstance(item, int)
-        return self._lists[upload.mission_type].put(message.seq, item, upload.end - 1)
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> None:
+        self._lists[upload.mission_type].put(message.seq, _with_integer_position(message), upload.end - 1)
 
     def _finish(self, upload: ListUpload) -> None:
-        result = self._lists[upload.mission_type].finish(self._warn)
+        result: int = Result.ACCEPTED
+        try:
+            self._lists[upload.mission_type].finish(self._warn)
+        except ItemRefused as refused:
+            result = refused.result
         if upload.mission_type == MavMissionType.MISSION:
             self._vehicle.info("Flight plan received")
         self._end(upload, result)
@@ -280,31 +283,29 @@ class ArduPilotMissionServer(MissionServer):
         if self._fence_total == 0:
             self.fence.clear()
 
-    def _guide(self, item: MissionItem, current: int) -> int:
+    def _guide(self, item: MissionItem, current: int) -> None:
+        """Let GUIDED fly to an item. Raises ItemRefused."""
         stored_item = as_stored(item, self._vehicle.KIND)
-        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-            return stored_item
         if current == _ALTITUDE_CHANGE:  # The altitude change has no effect in the simulation.
-            return Result.ACCEPTED
+            return
         vehicle = self._vehicle
         point = vehicle.world_point(int(stored_item.x), int(stored_item.y), stored_item.z, stored_item.frame)
         is_waypoint = stored_item.command == MavCmd.NAV_WAYPOINT
         if vehicle.mode is not vehicle.guided or not is_waypoint or point is None:
-            return Result.ERROR
+            raise ItemRefused(Result.ERROR)
         vehicle.guided.go_to(point)
-        return Result.ACCEPTED
 
 
-def _with_integer_position(message: AnyItem) -> MissionItem | int:
-    """Return the item with integers x and y, or the MAV_MISSION_RESULT of an invalid position."""
+def _with_integer_position(message: AnyItem) -> MissionItem:
+    """Return the item with integers x and y. Raises ItemRefused for an invalid position."""
     item = item_from(message)
     if isinstance(message, m.MissionItemInt):
         return item
     if not has_location(item.command):
         return item.replace(x=to_int(item.x), y=to_int(item.y))
     if not abs(item.x) <= 90.0:
-        return Result.INVALID_PARAM5_X
+        raise ItemRefused(Result.INVALID_PARAM5_X)
     if not abs(item.y) <= 180.0:
-        return Result.INVALID_PARAM6_Y
+        raise ItemRefused(Result.INVALID_PARAM6_Y)
     # Like the firmware, convert the degrees in single precision.
     return item.replace(x=int(float32(item.x * _DEGREE)), y=int(float32(item.y * _DEGREE)))

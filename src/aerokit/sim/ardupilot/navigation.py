@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from aerokit.mavlink.enums import EkfStatusFlags as Ekf
 from aerokit.mavlink.enums import GpsFixType, MavMissionType, MavSeverity
+from aerokit.sim.ardupilot.external import ArduPilotExternal
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.motion import GlobalPoint, LocalFrame, Ned
 
@@ -31,9 +32,9 @@ class ArduPilotNavigation:
     the world frame, whose origin is the power-on location.
     """
 
-    def __init__(self, vehicle: ArduPilotHost, frame: LocalFrame) -> None:
-        self._vehicle = vehicle
-        self.frame = frame
+    def __init__(self, vehicle: ArduPilotHost, external: ArduPilotExternal) -> None:
+        self._vehicle, self._external = vehicle, external
+        self.frame: LocalFrame = vehicle.frame
         self.flags: int | None = None  # EKF_STATUS_FLAGS; None until the estimator runs.
         self.fix_type: int = GpsFixType.NO_GPS
         self.is_gps_detected: bool = False
@@ -57,7 +58,8 @@ class ArduPilotNavigation:
         call_later(timeline.origin_set, self._set_origin_when_possible)
         call_later(timeline.healthy, self._become_healthy)
         call_later(timeline.position_good, self._use_gps_when_possible)
-        call_later(min(timeline.yaw_aligned, timeline.gps_fix), self._watch)
+        watch_at = min(timeline.yaw_aligned, timeline.gps_fix)
+        call_later(watch_at, lambda: self._vehicle.every(_CHECK_INTERVAL_S, self._check))
 
     @property
     def has_position(self) -> bool:
@@ -123,9 +125,6 @@ class ArduPilotNavigation:
     def uses_external(self) -> bool:
         return self._vehicle.parameters.get("EK3_SRC1_POSXY", 0.0) == _EXTERNAL_NAVIGATION
 
-    def _watch(self) -> None:
-        self._vehicle.every(_CHECK_INTERVAL_S, self._check)
-
     def _check(self) -> None:
         self._check_external()
         if self._watches_gps:
@@ -134,8 +133,7 @@ class ArduPilotNavigation:
     def _check_external(self) -> None:
         if not self.uses_external or not self.has_attitude:
             return
-        age = self._vehicle.external.navigation_age_s
-        if age > _POSITION_TIMEOUT_S:
+        if self._external.navigation_age_s > _POSITION_TIMEOUT_S:
             self.flags = _ATTITUDE_ONLY
             return
         if self.flags == _ATTITUDE_ONLY:

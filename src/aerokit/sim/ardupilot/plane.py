@@ -111,6 +111,7 @@ class SimulatedPlane(PlaneHost):
     FIRMWARE: ClassVar[str] = "ArduPlane"
     MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
+    BASE_FLAGS: ClassVar[int] = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
     CAPABILITIES: ClassVar[int] = 0xF36F
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
@@ -118,6 +119,7 @@ class SimulatedPlane(PlaneHost):
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = PlaneFailsafes
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = PlaneFence
     MOTORS: ClassVar[type[ArduPilotMotors]] = PlaneEngine
+    SETPOINTS: ClassVar[type[Any]] = PlaneSetpoints
 
     fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -137,9 +139,6 @@ class SimulatedPlane(PlaneHost):
             MavCmd.DO_FLIGHTTERMINATION: self._terminate,
         }
 
-    def listen_for_setpoints(self) -> None:
-        PlaneSetpoints(self)
-
     def text_for_unknown_mode(self, number: int) -> tuple[int, str]:
         if number in _LIFTING_MODES:
             return MavSeverity.INFO, "Q_ENABLE 0"
@@ -155,8 +154,7 @@ class SimulatedPlane(PlaneHost):
     @property
     def base_mode(self) -> int:
         flags = int(self.mode.flags) if isinstance(self.mode, PlaneModeBase) else 0
-        armed = MavModeFlag.SAFETY_ARMED if self.motors.is_armed else 0
-        return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
+        return super().base_mode | flags
 
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds. A plane that rests for a while counts as landed."""
@@ -179,7 +177,7 @@ class SimulatedPlane(PlaneHost):
         return self.change_to(PlaneMode.AUTO)
 
     def _reposition(self, command: ReceivedCommand) -> int:
-        if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
+        if command.is_long:  # ArduPilot requires the altitude frame of a COMMAND_INT.
             return MavResult.UNSUPPORTED
         point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:

@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import HeadingType, MavFrame, MavResult, MavSeverity,
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES
 from aerokit.sim.ardupilot.mission_run import MissionMode, set_home_from
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
@@ -23,7 +24,6 @@ from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, t
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
-_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 _REACHED_HEIGHT_M = 5.0
 _ON_CIRCLE_SHARE = 1.3
 
@@ -187,7 +187,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         if has_no_place:  # Zero coordinates mean the present position.
             north, east = own_north, own_east
         if manoeuvre == _LOITER:  # An altitude of 0 in a relative frame means the present altitude (Location.cpp).
-            keeps_altitude = item.z == 0 and item.frame not in _ABSOLUTE
+            keeps_altitude = item.z == 0 and item.frame not in ABSOLUTE_FRAMES
         else:  # With zero coordinates, an altitude of 0 means the present altitude (commands.cpp, set_next_WP).
             keeps_altitude = item.z == 0 and has_no_place
         if keeps_altitude:

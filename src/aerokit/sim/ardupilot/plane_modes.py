@@ -161,7 +161,7 @@ class PlaneLanding:
                 plane.info(f"Distance from LAND point={wing.distance_to(self.point):.2f}m")
 
 
-_MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
+_LOW_THROTTLE = 1100
 _CENTERED_STICK = 0.05  # A stick with at most this deflection counts as centered.
 _CIRCLE_BANK_SHARE = 1 / 3
 # A take-off is complete when the plane is this many metres below the target altitude.
@@ -176,10 +176,6 @@ class PlaneModeBase(ArduPilotMode):
     needs_position = False
     flags: int = MavModeFlag.STABILIZE_ENABLED
     """MAV_MODE_FLAGs in HEARTBEAT."""
-
-    def stick(self, index: int) -> float:
-        """Return a stick position, -1 to 1."""
-        return (self.vehicle.rc[index] - _MID_STICK) / _STICK_RANGE
 
 
 class PlanePilotedMode(PlaneModeBase):
@@ -196,12 +192,12 @@ class PlanePilotedMode(PlaneModeBase):
             wing.roll_out()
             return
         plane.lift_off()
-        climb = self.stick(RC_PITCH) * limits.climb_m_s  # A pulled stick has a positive value, and climbs.
+        climb = self.vehicle.stick(RC_PITCH) * limits.climb_m_s  # A pulled stick has a positive value, and climbs.
         if is_idle:  # Without thrust, the plane glides, and a pulled stick has no effect.
             climb = min(climb, 0.0) - limits.glide_sink_m_s
         throttle = max(0.0, min(1.0, (throttle_pulse - 1000) / 1000))
         speed = throttle * 2 * plane.cruise_m_s  # Half throttle flies at cruise speed.
-        wing.bank_and_climb(speed, self.stick(RC_ROLL) * limits.bank_rad, climb)
+        wing.bank_and_climb(speed, self.vehicle.stick(RC_ROLL) * limits.bank_rad, climb)
 
 
 class PlaneAltitudeMode(PlaneModeBase):
@@ -225,12 +221,12 @@ class PlaneAltitudeMode(PlaneModeBase):
 
     def climb_rate(self) -> float:
         """Return the climb rate in m/s that the pitch stick commands."""
-        return self.stick(RC_PITCH) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
+        return self.vehicle.stick(RC_PITCH) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
 
     def steer(self, climb: float) -> None:
         """Bank as the roll stick commands, and climb at ``climb`` m/s."""
         wing = self.vehicle.wing
-        wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(RC_ROLL) * wing.wing_limits.bank_rad, climb)
+        wing.bank_and_climb(self.vehicle.cruise_m_s, self.vehicle.stick(RC_ROLL) * wing.wing_limits.bank_rad, climb)
 
 
 class PlaneCruise(PlaneAltitudeMode):
@@ -242,7 +238,7 @@ class PlaneCruise(PlaneAltitudeMode):
 
     def steer(self, climb: float) -> None:
         wing = self.vehicle.wing
-        if abs(self.stick(RC_ROLL)) > _CENTERED_STICK:  # The pilot turns, so no course is held.
+        if abs(self.vehicle.stick(RC_ROLL)) > _CENTERED_STICK:  # The pilot turns, so no course is held.
             self._course = None
             super().steer(climb)
             return

@@ -43,6 +43,7 @@ class ArduPilotRadio:
         self._sticks: list[int] = list(_AT_REST)
         # Maps a channel index to the pulse width (0 if released) and the time at which it was received.
         self._overrides: dict[int, tuple[int, float]] = {}
+        vehicle.on(m.RcChannelsOverride, self._on_override)
 
     def __len__(self) -> int:
         return len(self._sticks)
@@ -87,9 +88,6 @@ class ArduPilotRadio:
 
     def release_overrides(self) -> None:
         self._overrides.clear()
-
-    def listen(self) -> None:
-        self._vehicle.on(m.RcChannelsOverride, self._on_override)
 
     def _override_time(self) -> float:
         seconds = self._vehicle.parameters["RC_OVERRIDE_TIME"]

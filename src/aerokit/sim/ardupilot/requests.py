@@ -8,6 +8,7 @@ from typing import NamedTuple
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavDataStream as Stream
 from aerokit.mavlink.enums import MavResult
+from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.channel import Channel
@@ -84,7 +85,7 @@ class ArduPilotMessageRequests:
             return MavResult.DENIED
         if interval_us < -1:
             return MavResult.DENIED
-        # -1 and 0 turn the stream off. For HEARTBEAT, 0 selects the default of one second.
+        # SET_MESSAGE_INTERVAL: -1 and 0 turn a stream off. For HEARTBEAT, 0 selects the default of one second.
         interval = max(0, interval_us) / 1e6
         if interval_us == 0 and message_id == m.Heartbeat.ID:
             interval = 1.0
@@ -173,7 +174,7 @@ class ArduPilotMessageRequests:
         previous_value, previous_change = parameters[name], self._changed_rates.get(name)
         parameters[name] = rate
         if vehicle.KIND == "plane":  # Only ArduPlane saves stream rates beyond a reboot (persist_streamrates).
-            vehicle.announce_parameter(name)
+            vehicle.storage.parameters.send(name, UNKNOWN_INDEX, None)
         elif previous_change is None:
             self._changed_rates[name] = _ChangedRate(value_after_reboot=previous_value, requested=rate)
         else:

@@ -260,7 +260,7 @@ class RoverSetpoints(GuidedSetpoints):
             target = GuidedTarget(velocity=velocity, backwards=backwards, yaw=heading)
         else:
             target = GuidedTarget(velocity=velocity, backwards=backwards, yaw_rate=message.body_yaw_rate)
-        self.mode.set_target(target)
+        self.vehicle.guided.set_target(target)
 
 
 _AMPERES_AT_FULL = 16.0
@@ -280,7 +280,6 @@ class RoverMotors(ArduPilotMotors):
             self.throttle = 0.0
 
 
-_GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
 _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
 
 
@@ -299,6 +298,8 @@ class SimulatedRover(RoverHost):
     MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     REPORTS_HOME: ClassVar[bool] = True
+    BASE_FLAGS: ClassVar[int] = MavModeFlag.CUSTOM_MODE_ENABLED
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
     CAPABILITIES: ClassVar[int] = 0xF1EF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = ROVER_MODES
@@ -307,6 +308,7 @@ class SimulatedRover(RoverHost):
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = RoverFence
     MOTORS: ClassVar[type[ArduPilotMotors]] = RoverMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
+    SETPOINTS: ClassVar[type[Any]] = RoverSetpoints
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
@@ -321,9 +323,6 @@ class SimulatedRover(RoverHost):
         )
         return GroundMotion(self.rng, limits, wind)
 
-    def listen_for_setpoints(self) -> None:
-        RoverSetpoints(self, self.guided)
-
     @property
     def is_standby(self) -> bool:
         return self.mode.number == RoverMode.HOLD
@@ -334,14 +333,8 @@ class SimulatedRover(RoverHost):
 
     @property
     def base_mode(self) -> int:
-        flags, mode_name = int(MavModeFlag.CUSTOM_MODE_ENABLED), self.mode.name
-        if mode_name in _MANUAL_INPUT:
-            flags |= MavModeFlag.MANUAL_INPUT_ENABLED
-        if mode_name in _GUIDED_MODES:
-            flags |= MavModeFlag.GUIDED_ENABLED
-        if self.motors.is_armed:
-            flags |= MavModeFlag.SAFETY_ARMED
-        return flags
+        manual_input = MavModeFlag.MANUAL_INPUT_ENABLED if self.mode.name in _MANUAL_INPUT else 0
+        return super().base_mode | manual_input
 
     @property
     def is_at_rest(self) -> bool:

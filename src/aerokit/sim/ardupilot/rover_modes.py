@@ -117,8 +117,7 @@ class _Rtl(_Mode):
         if is_reached:
             del self._path[0]
         else:
-            north, east, _ = next_place
-            rover.motion.drive_to(north, east, speed=self.speed, stops=is_last)
+            rover.motion.drive_to(next_place, speed=self.speed, stops=is_last)
 
 
 class _SmartRtl(_Rtl):
@@ -154,8 +153,7 @@ class RoverAuto(RoverSubAuto):
         if stops and self.has_arrived(place):
             self.vehicle.motion.stop()
         else:
-            north, east, _ = place
-            self.vehicle.motion.drive_to(north, east, speed=self.speed, stops=stops)
+            self.vehicle.motion.drive_to(place, speed=self.speed, stops=stops)
 
     def has_arrived(self, place: Ned) -> bool:
         return self.vehicle.has_arrived(place) if self._stops else self.vehicle.has_passed(place)
@@ -214,8 +212,7 @@ class RoverGuided(GuidedTargetMode):
         if self._has_arrived:
             rover.motion.stop()
         else:
-            north, east, _ = place
-            rover.motion.drive_to(north, east, speed=self.speed)
+            rover.motion.drive_to(place, speed=self.speed)
 
     def _follow(self, target: GuidedTarget) -> None:
         north, east, _ = target.velocity or (0.0, 0.0, 0.0)

@@ -79,9 +79,8 @@ class GuidedSetpoints:
     GLOBAL_YAW: ClassVar[bool] = True
     """True if the firmware uses the yaw and the turn rate of SET_POSITION_TARGET_GLOBAL_INT."""
 
-    def __init__(self, vehicle: ArduPilotVehicle, mode: GuidedTargetMode) -> None:
-        self.vehicle: ArduPilotVehicle = vehicle
-        self.mode: GuidedTargetMode = mode
+    def __init__(self, vehicle: RoverSubVehicle) -> None:
+        self.vehicle: RoverSubVehicle = vehicle
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
@@ -97,7 +96,7 @@ class GuidedSetpoints:
 
     @property
     def _is_guided(self) -> bool:
-        return self.vehicle.mode.number == self.mode.number
+        return self.vehicle.mode is self.vehicle.guided
 
     def _on_attitude(self, message: SetAttitudeTarget, _: Channel) -> None:
         if self._is_guided and all(map(math.isfinite, (*message.q, message.thrust, message.body_yaw_rate))):
@@ -137,14 +136,15 @@ class GuidedSetpoints:
             velocity = rotated(velocity, self.vehicle.motion.yaw)
         target = GuidedTarget(position, velocity, backwards=backwards, yaw=yaw, yaw_rate=yaw_rate)
         if self.is_complete(target):
-            self.mode.set_target(target)
-
-
-_STICK_MIDDLE, _STICK_RANGE = 1500.0, 500.0
+            self.vehicle.guided.set_target(target)
 
 
 class RoverSubVehicle(ArduPilotVehicle):
     """Base of Rover and Sub. Takes the arguments of `ArduPilotVehicle`."""
+
+    @property
+    def guided(self) -> GuidedTargetMode:
+        raise NotImplementedError
 
     @property
     def is_at_rest(self) -> bool:
@@ -162,10 +162,6 @@ class RoverSubVehicle(ArduPilotVehicle):
     @is_landed.setter
     def is_landed(self, _: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Ignore the assigned value, because these vehicles do not take off."""
-
-    def stick(self, index: int) -> float:
-        """Return a stick position, -1 to 1."""
-        return (self.rc[index] - _STICK_MIDDLE) / _STICK_RANGE
 
     def tick(self, dt: float) -> None:
         if self.motors.is_armed:

@@ -22,8 +22,6 @@ from aerokit.sim.missions import MissionMount
 from aerokit.sim.parameter_server import ArduPilotParameterServer, ParameterServer, rounded
 from aerokit.sim.parameters import ParameterPackMount
 
-DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
-
 _SYSTEM_TEXTS = {
     "threads.txt": "ThreadsV1\n",
     "tasks.txt": "TasksV2\n",
@@ -40,11 +38,11 @@ class ArduPilotLogServer(LogServer):
     """
 
     FOLDER: ClassVar[str] = "/APM/LOGS"
+    _vehicle: ArduPilotHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, vehicle: ArduPilotHost, logs: Sequence[SimulatedLog], files: FileTree) -> None:
         super().__init__(vehicle, logs, files)
         files.put(f"{self.FOLDER}/LASTLOG.TXT", f"{len(logs)}\r\n".encode())
-        self._ardupilot = vehicle
         self._has_warned = False
 
     def path(self, index: int) -> str:
@@ -83,7 +81,7 @@ class ArduPilotLogServer(LogServer):
             super()._on_end(request, channel)
 
     def _refuses_while_armed(self) -> bool:
-        armed = self._ardupilot.is_armed
+        armed = self._vehicle.is_armed
         if armed and not self._has_warned:
             self._vehicle.send_text(MavSeverity.ERROR, "Disarm for log download")
         self._has_warned = armed
@@ -143,34 +141,34 @@ class ArduPilotSigning(VehicleSigning):
     """
 
     AHEAD: ClassVar[int] = ONE_MINUTE
+    _vehicle: ArduPilotHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, vehicle: ArduPilotHost, key: SigningKey | None, timestamp: int) -> None:
         super().__init__(vehicle, key, timestamp)
         self.trusts_first_port = True
-        self._ardupilot = vehicle
         vehicle.on_power_on(self._keep_time)
 
     def is_for(self, link_id: int) -> bool:
         name = f"MAV{link_id + 1}_OPTIONS"
-        parameters = self._ardupilot.parameters
+        parameters = self._vehicle.parameters
         return not (name in parameters and int(parameters[name]) & _SIGNING_OFF)
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        return _accept_all if link_id == 0 and self.trusts_first_port else None
+        return (lambda _: True) if link_id == 0 and self.trusts_first_port else None
 
     def may_change(self) -> bool:
-        if self._ardupilot.is_armed:
-            self._ardupilot.send_text(MavSeverity.WARNING, "ERROR: Won't setup signing when armed")
+        if self._vehicle.is_armed:
+            self._vehicle.send_text(MavSeverity.WARNING, "ERROR: Won't setup signing when armed")
             return False
         return True
 
     def _keep_time(self) -> None:
-        self._ardupilot.every(_SAVE_INTERVAL_S, self._save)
-        self._ardupilot.call_later(self._ardupilot.timeline.gps_fix, self._on_gps_time)
+        self._vehicle.every(_SAVE_INTERVAL_S, self._save)
+        self._vehicle.call_later(self._vehicle.timeline.gps_fix, self._on_gps_time)
 
     def _on_gps_time(self) -> None:
-        stamp = timestamp_at(int(self._ardupilot.unix_time))
-        for channel in self._ardupilot.channels:
+        stamp = timestamp_at(int(self._vehicle.unix_time))
+        for channel in self._vehicle.channels:
             if channel.signing is not None:
                 channel.signing.timestamp = max(channel.signing.timestamp, stamp)
         self._save()
@@ -178,10 +176,6 @@ class ArduPilotSigning(VehicleSigning):
     def _save(self) -> None:
         if self.key is not None:
             port_timestamps = [
-                channel.signing.timestamp for channel in self._ardupilot.channels if channel.signing is not None
+                channel.signing.timestamp for channel in self._vehicle.channels if channel.signing is not None
             ]
             self.timestamp: int = max([self.timestamp, *port_timestamps])
-
-
-def _accept_all(_: Frame) -> bool:
-    return True

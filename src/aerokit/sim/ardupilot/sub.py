@@ -209,7 +209,7 @@ class SubSetpoints(GuidedSetpoints):
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
         _, _, yaw = euler_from_quaternion(*message.q)
-        self.mode.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
+        self.vehicle.guided.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
 
 
 _HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44
@@ -232,7 +232,6 @@ class SubMotors(ArduPilotMotors):
         self.throttle: float = max(0.0, min(1.0, throttle)) if self.is_armed else 0.0
 
 
-_GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
 _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED
 
 
@@ -250,6 +249,8 @@ class SimulatedSub(SubHost):
     KIND: ClassVar[Kind] = "sub"
     FIRMWARE: ClassVar[str] = "ArduSub"
     MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
+    BASE_FLAGS: ClassVar[int] = int(_BASE)
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
     CAPABILITIES: ClassVar[int] = 0xF9E7
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = SUB_MODES
@@ -257,13 +258,11 @@ class SimulatedSub(SubHost):
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = SubFailsafes
     MOTORS: ClassVar[type[ArduPilotMotors]] = SubMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
+    SETPOINTS: ClassVar[type[Any]] = SubSetpoints
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
         """Create the motion model. Each unit of SIM_BUOYANCY accelerates upwards by 0.1 m/s². Wind has no effect."""
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
-
-    def listen_for_setpoints(self) -> None:
-        SubSetpoints(self, self.guided)
 
     def reset_controllers(self) -> None:
         self.display_names: cycle[str] = cycle(DISPLAY_VALUES)
@@ -281,15 +280,6 @@ class SimulatedSub(SubHost):
     @property
     def guided(self) -> SubGuided:
         return self.mode_of(SubGuided)
-
-    @property
-    def base_mode(self) -> int:
-        flags = int(_BASE)
-        if self.mode.name in _GUIDED_MODES:
-            flags |= MavModeFlag.GUIDED_ENABLED
-        if self.motors.is_armed:
-            flags |= MavModeFlag.SAFETY_ARMED
-        return flags
 
     @property
     def is_at_rest(self) -> bool:

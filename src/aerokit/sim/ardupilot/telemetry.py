@@ -270,11 +270,6 @@ def _autopilot_version(vehicle: ArduPilotVehicle) -> m.AutopilotVersion:
     )  # fmt: skip
 
 
-def _relay_status(vehicle: ArduPilotVehicle) -> m.RelayStatus:
-    outputs = vehicle.accessories
-    return m.RelayStatus(vehicle.time_boot_ms, outputs.relays, (1 << outputs.relay_count) - 1)
-
-
 def _angle_of_attack(plane: PlaneHost) -> m.AoaSsa:
     motion = plane.motion
     slope = math.atan2(-motion.velocity_down, max(motion.airspeed_m_s, 1.0))
@@ -301,15 +296,11 @@ _OUTPUTS = 16
 _FULL_ROLL_RATE, _FULL_PITCH_RATE = 1.5, 0.5
 
 
-def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
-    return _servo_outputs(vehicle, *(vehicle.motors.pwm,) * 4)
-
-
 def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
     wing, is_armed = plane.wing, plane.motors.is_armed
     throttle = 1000 + (round(1000 * plane.motors.throttle) if is_armed else 0)
     if plane.mode.number == PlaneMode.MANUAL:
-        aileron, elevator, rudder = (_pulse(_stick(plane.rc[channel])) for channel in (RC_ROLL, RC_PITCH, RC_YAW))
+        aileron, elevator, rudder = (_pulse(plane.stick(channel)) for channel in (RC_ROLL, RC_PITCH, RC_YAW))
         throttle = max(1000, min(2000, plane.rc[RC_THROTTLE])) if is_armed else 1000
     else:
         # The motion model has no surfaces. The deflections are derived from the rates of the plane.
@@ -336,9 +327,7 @@ def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
 def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
     thrusters = [_MIDDLE] * 6
     if sub.motors.is_armed:
-        yaw, forward, lateral, roll = (
-            _stick(sub.rc[channel]) for channel in (RC_YAW, SUB_FORWARD, SUB_LATERAL, SUB_ROLL)
-        )
+        yaw, forward, lateral, roll = (sub.stick(channel) for channel in (RC_YAW, SUB_FORWARD, SUB_LATERAL, SUB_ROLL))
         # The signs are the motor factors of the frame VECTORED (AP_Motors6DOF.cpp). The vertical thrusters have the
         # throttle factor -1: their pulses fall below the middle for a throttle above one half.
         vertical = -(2.0 * sub.motors.throttle - 1.0)
@@ -357,10 +346,6 @@ def _servo_outputs(vehicle: ArduPilotVehicle, *pulses: int) -> m.ServoOutputRaw:
         if 1 <= number <= _OUTPUTS:
             outputs[number - 1] = pulse
     return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, *outputs)
-
-
-def _stick(pwm: int) -> float:
-    return (pwm - _MIDDLE) / _STICK_RANGE
 
 
 def _pulse(share: float) -> int:
@@ -385,7 +370,9 @@ _ALL: Builders = {
     m.Vibration.ID: _vibration,
     m.EscTelemetry1To4.ID: _esc_telemetry,
     m.AutopilotVersion.ID: _autopilot_version,
-    m.RelayStatus.ID: _relay_status,
+    m.RelayStatus.ID: lambda vehicle: m.RelayStatus(
+        vehicle.time_boot_ms, vehicle.accessories.relays, (1 << vehicle.accessories.relay_count) - 1
+    ),
     m.FlightInformation.ID: lambda vehicle: m.FlightInformation(
         vehicle.time_boot_ms, arming_time_utc=0, takeoff_time_utc=0, flight_uuid=0
     ),
@@ -410,7 +397,7 @@ def _without(*message_ids: int) -> Builders:
 BUILDERS_OF_KIND: dict[Kind, Builders] = {
     "copter": {
         **_without(),
-        m.ServoOutputRaw.ID: _copter_outputs,
+        m.ServoOutputRaw.ID: lambda vehicle: _servo_outputs(vehicle, *(vehicle.motors.pwm,) * 4),
         m.WinchStatus.ID: lambda vehicle: vehicle.devices.winch_status(),
     },
     "plane": {

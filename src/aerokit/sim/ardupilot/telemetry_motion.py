@@ -23,10 +23,6 @@ from aerokit.sim.motion import GRAVITY_M_S2, centidegrees, quaternion_from_euler
 Three = tuple[int, int, int]
 
 
-def _attitude(vehicle: ArduPilotVehicle) -> m.Attitude:
-    return m.Attitude(vehicle.time_boot_ms, *vehicle.motion.angles, *vehicle.motion.angular_rates)
-
-
 def _attitude_quaternion(vehicle: ArduPilotVehicle) -> m.AttitudeQuaternion | None:
     if not vehicle.navigation.has_attitude:
         return None
@@ -324,7 +320,7 @@ def _height_above_ground(vehicle: ArduPilotVehicle) -> float | None:
 
 
 MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
-    m.Attitude.ID: _attitude,
+    m.Attitude.ID: lambda v: m.Attitude(v.time_boot_ms, *v.motion.angles, *v.motion.angular_rates),
     m.AttitudeQuaternion.ID: _attitude_quaternion,
     m.AttitudeTarget.ID: _attitude_target,
     m.Ahrs.ID: _ahrs,

@@ -13,7 +13,6 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import SigningKey
-from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import ArduPilotCamera
 from aerokit.sim.ardupilot.devices import ArduPilotDevices
@@ -28,17 +27,17 @@ from aerokit.sim.ardupilot.mission_server import ArduPilotMissionServer
 from aerokit.sim.ardupilot.navigation import ArduPilotNavigation
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio, AuxiliaryOutputs
 from aerokit.sim.ardupilot.requests import ArduPilotMessageRequests
-from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, ArduPilotStorage
+from aerokit.sim.ardupilot.storage import ArduPilotSigning, ArduPilotStorage
 from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler
-from aerokit.sim.logs import SimulatedLog
+from aerokit.sim.logs import DEFAULT_LOGS, SimulatedLog
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
-_REBOOT_SILENCE_S = 1.5
 _TIMESYNC_INTERVAL_S = 10.0
+_STICK_MIDDLE, _STICK_RANGE = 1500, 500
 _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
 ModeT = TypeVar("ModeT", bound="ArduPilotMode")
 
@@ -62,6 +61,10 @@ class ArduPilotVehicle(ArduPilotHost):
     """
 
     MAV_TYPE: ClassVar[int]
+    BASE_FLAGS: ClassVar[int]
+    """MAV_MODE_FLAGs of the heartbeat in every mode."""
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset()
+    """Names of the modes in which the heartbeat has the flag GUIDED_ENABLED."""
     BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]]
     """Functions that build messages, by message id. A function returns None if there is nothing to send."""
     MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]]
@@ -72,6 +75,8 @@ class ArduPilotVehicle(ArduPilotHost):
     MOTORS: ClassVar[type[ArduPilotMotors]] = ArduPilotMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = ArduPilotJoystick
     """Receiver of MANUAL_CONTROL."""
+    SETPOINTS: ClassVar[type[Any]]
+    """Handlers of set-point messages."""
 
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
     """True if home cannot be set before the estimator has an origin."""
@@ -144,21 +149,23 @@ class ArduPilotVehicle(ArduPilotHost):
         self.has_left_boot: bool = False
         self.is_landed: bool = self.motion.is_on_ground
         self.motors: ArduPilotMotors = self.MOTORS(self)
-        self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.frame)
-        self.arming: ArduPilotArming[Any] = self.ARMING(self)
-        self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
-        self.devices: ArduPilotDevices = ArduPilotDevices(self)
+        self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.external)
         self.failsafes: ArduPilotFailsafes[Any] = self.FAILSAFES(self)
+        self.arming: ArduPilotArming[Any] = self.ARMING(self, self.failsafes, self.calibrations.compasses)
+        self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
+        self.devices: ArduPilotDevices = ArduPilotDevices(self, self.arming)
         self.fence: ArduPilotFence[Any] = self.FENCE(self)
         self.gimbal: ArduPilotGimbal = ArduPilotGimbal(self)
-        self.camera: ArduPilotCamera = ArduPilotCamera(self)
+        self.camera: ArduPilotCamera = ArduPilotCamera(self, self.gimbal)
         self.calibrations.reset()
         self.external.reset()
         self.rc.release_overrides()
         modes = [make_mode(self) for make_mode in self.MODES]
         self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in modes}
         self.reset_controllers()
-        self.mission: MissionRun = MissionRun(self, self.auto)  # executes the mission that `missions` stores
+        self.mission: MissionRun = MissionRun(
+            self, self.auto, self.camera
+        )  # executes the mission that `missions` stores
         self.missions.reset()
         self.mode: ArduPilotMode = self._modes[self.first_mode]
 
@@ -168,13 +175,10 @@ class ArduPilotVehicle(ArduPilotHost):
     def _listen(self) -> None:
         self.requests: ArduPilotMessageRequests = ArduPilotMessageRequests(self, stream_groups=self._stream_groups)
         self.serve_commands(self.make_commands())
-        self.listen_for_setpoints()
+        self.SETPOINTS(self)
         self.on(m.Heartbeat, self._on_heartbeat)
         self.on(m.SetMode, self._on_set_mode)
-        self.rc.listen()
-        self.external.listen()
         self.JOYSTICK(self)
-        self.missions.listen()
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         """Create the motion model."""
@@ -183,9 +187,6 @@ class ArduPilotVehicle(ArduPilotHost):
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return the handler of each MAV_CMD."""
         raise NotImplementedError
-
-    def listen_for_setpoints(self) -> None:
-        """Register the handlers of set-point messages."""
 
     def look_at(self, place: Ned | None) -> None:
         """Point the gimbal, if there is one, at a place. None returns it to its default mode."""
@@ -219,7 +220,13 @@ class ArduPilotVehicle(ArduPilotHost):
     @property
     def base_mode(self) -> int:
         """MAV_MODE_FLAGs of the heartbeat."""
-        raise NotImplementedError
+        guided = MavModeFlag.GUIDED_ENABLED.value if self.mode.name in self.GUIDED_MODES else 0
+        armed = MavModeFlag.SAFETY_ARMED.value if self.is_armed else 0
+        return self.BASE_FLAGS | guided | armed
+
+    def stick(self, index: int) -> float:
+        """Return the position of a stick from -1 to 1."""
+        return (self.rc[index] - _STICK_MIDDLE) / _STICK_RANGE
 
     def move(self, dt: float) -> None:
         """Move for ``dt`` seconds, and report a touchdown."""
@@ -254,7 +261,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.info("AHRS: DCM active")
         self.arming.start()
         self.failsafes.start()
-        # SITL is still in MAV_STATE_BOOT for about half a second after these texts.
+        # SITL is still in MAV_STATE_BOOT for about half a second after it has reported "ArduPilot Ready".
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
 
     def _leave_boot(self) -> None:
@@ -268,10 +275,6 @@ class ArduPilotVehicle(ArduPilotHost):
         channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, heartbeat_at))
         channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_INTERVAL_S, max(self.now, timesync_at))
         self.requests.start_channel(channel, max(self.now, ready_at))
-
-    def restart(self) -> None:
-        """Reboot, with the silence of the real firmware."""
-        self.reboot(_REBOOT_SILENCE_S)
 
     def reboot(self, silence_s: float) -> None:
         """See `SimulatedVehicle.reboot`. Resets estimates and the autopilot's own devices, such as its gimbal."""
@@ -331,9 +334,6 @@ class ArduPilotVehicle(ArduPilotHost):
         mode = self._modes[kind.number]
         assert isinstance(mode, kind)
         return mode
-
-    def announce_parameter(self, name: str) -> None:
-        self.storage.parameters.send(name, UNKNOWN_INDEX, None)
 
     def available_modes(self) -> list[m.AvailableModes]:
         return [

@@ -1,4 +1,4 @@
-"""Memory card, lens and view of a simulated camera."""
+"""Memory card and lens of a simulated camera, and CAMERA_IMAGE_CAPTURED."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CameraZoomType, SetFocusType, StorageStatus, StorageType, StorageUsageFlag
-from aerokit.mavlink.messages import StorageInformation
-from aerokit.sim.components.component import SimulatedComponent, pose_of
-from aerokit.sim.motion import GlobalPoint, LocalFrame, quaternion_from_euler
+from aerokit.mavlink.enums import CameraZoomType, SetFocusType
+from aerokit.sim.components.component import pose_of
+from aerokit.sim.motion import GlobalPoint, quaternion_from_euler
 from aerokit.sim.vehicle import SimulatedVehicle
 
 GREY_JPEG = base64.b85decode(
@@ -20,9 +19,6 @@ GREY_JPEG = base64.b85decode(
 """A grey image of 16 × 16 pixels."""
 
 Angles = tuple[float, float, float]
-
-_READ_MIB_S, _WRITE_MIB_S = 90.0, 45.0
-_STORAGE_ID = 1
 
 
 class MemoryCard:
@@ -43,24 +39,6 @@ class MemoryCard:
             return False
         self.used_mib += size_mib
         return True
-
-    def format(self) -> None:
-        self.used_mib = 0.0
-
-    def information(self, camera: SimulatedComponent, number: int) -> list[StorageInformation]:
-        if number not in (0, _STORAGE_ID):
-            return []
-        is_inserted = self.is_inserted
-        return [
-            StorageInformation(
-                time_boot_ms=camera.time_boot_ms, storage_id=_STORAGE_ID, storage_count=1,
-                status=StorageStatus.READY if is_inserted else StorageStatus.EMPTY,
-                total_capacity=self.capacity_mib if is_inserted else 0.0,
-                used_capacity=self.used_mib if is_inserted else 0.0, available_capacity=self.free_mib,
-                read_speed=_READ_MIB_S, write_speed=_WRITE_MIB_S, type=StorageType.MICROSD, name="SD",
-                storage_usage=StorageUsageFlag.SET | StorageUsageFlag.PHOTO | StorageUsageFlag.VIDEO,
-            )
-        ]  # fmt: skip
 
 
 FOCAL_LENGTH_MM = 4.5
@@ -95,9 +73,17 @@ class Axis:
         self._start_at = self._now()
         self._speed = max(-1.0, min(1.0, speed)) * _MAX_SPEED_PERCENT_S
 
-    def step(self, steps: float) -> None:
-        """Change the setting by ``steps`` tenths of its range."""
-        self.set(self.percent + steps * _STEP_PERCENT)
+    def adjust(self, kind: int, value: float) -> bool:
+        """Apply a CAMERA_ZOOM_TYPE, or the SET_FOCUS_TYPE with the same number. Return False for other numbers."""
+        if kind == CameraZoomType.STEP:  # The value is in tenths of the range.
+            self.set(self.percent + value * _STEP_PERCENT)
+        elif kind == CameraZoomType.CONTINUOUS:
+            self.move(value)
+        elif kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
+            self.set(value)
+        else:
+            return False
+        return True
 
 
 class Lens:
@@ -113,33 +99,20 @@ class Lens:
 
     def set_zoom(self, kind: int, value: float) -> bool:
         """Apply SET_CAMERA_ZOOM. Return False if the type or the value is not supported."""
-        if kind == CameraZoomType.STEP:
-            self.zoom.step(value)
-        elif kind == CameraZoomType.CONTINUOUS:
-            self.zoom.move(value)
-        elif kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:
-            self.zoom.set(value)
-        elif kind == CameraZoomType.FOCAL_LENGTH and 1.0 <= value / FOCAL_LENGTH_MM <= _ZOOM_FACTOR:
-            zoom_factor = value / FOCAL_LENGTH_MM
-            self.zoom.set((zoom_factor - 1.0) / (_ZOOM_FACTOR - 1.0) * 100.0)
-        else:
-            return False
+        zoom_factor = value / FOCAL_LENGTH_MM
+        if kind != CameraZoomType.FOCAL_LENGTH or not 1.0 <= zoom_factor <= _ZOOM_FACTOR:
+            return self.zoom.adjust(kind, value)
+        self.zoom.set((zoom_factor - 1.0) / (_ZOOM_FACTOR - 1.0) * 100.0)
         return True
 
     def set_focus(self, kind: int, value: float) -> bool:
         """Apply SET_CAMERA_FOCUS. Return False if the type or the value is not supported."""
-        if kind == SetFocusType.STEP:
-            self.focus.step(value)
-        elif kind == SetFocusType.CONTINUOUS:
-            self.focus.move(value)
-        elif kind == SetFocusType.RANGE and 0.0 <= value <= 100.0:
-            self.focus.set(value)
-        elif kind == SetFocusType.METERS and value > 0.0:
+        if kind == SetFocusType.METERS and value > 0.0:
             self.focus.set(100.0 * value / (value + _HALF_RANGE_FOCUS_M))  # 100 % is infinity.
         elif kind in _AUTO:
             self.focus.set(_SHARP_PERCENT)
         else:
-            return False
+            return self.focus.adjust(kind, value)
         return True
 
 
@@ -165,28 +138,3 @@ def captured_image(
         q=_UNKNOWN_ATTITUDE if angles is None else quaternion_from_euler(*angles), image_index=index,
         capture_result=result, file_url="",
     )  # fmt: skip
-
-
-# With a pitch above this limit, the optical axis meets the ground too far away or not at all.
-_MAX_GROUND_PITCH_RAD = -math.radians(5)
-_UNKNOWN, _ACCURACY_M = math.nan, 1.0
-
-
-def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | None) -> list[m.CameraTrackingGeoStatus]:
-    """Return CAMERA_TRACKING_GEO_STATUS for the point where the optical axis meets the ground."""
-    pose = pose_of(component.vehicle)
-    if pose is None or angles is None:
-        return []
-    _, pitch, yaw = angles
-    if pitch > _MAX_GROUND_PITCH_RAD:
-        return []
-    # The ground is level, at the altitude of home.
-    distance = pose.height_m / math.tan(-pitch)
-    place = LocalFrame(pose.place).to_global(distance * math.cos(yaw), distance * math.sin(yaw), pose.height_m)
-    return [
-        m.CameraTrackingGeoStatus(
-            tracking_status=flags, lat=place.latitude_e7, lon=place.longitude_e7, alt=place.altitude_m,
-            h_acc=_ACCURACY_M, v_acc=_ACCURACY_M, vel_n=0.0, vel_e=0.0, vel_d=0.0, vel_acc=_UNKNOWN,
-            dist=math.hypot(distance, pose.height_m), hdg=_UNKNOWN, hdg_acc=_UNKNOWN,
-        )
-    ]  # fmt: skip

@@ -10,12 +10,12 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavAutopilot, MavState
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, Statustext
-from aerokit.parameters import CameraDefinition, SettingValue
-from aerokit.protocols.servers.definitions import DefinedParameterServer
+from aerokit.parameters import SettingValue
 from aerokit.protocols.servers.files import FileTree
 from aerokit.protocols.servers.ftp import SessionFtpServer
 from aerokit.protocols.servers.intervals import Builder as Builder
 from aerokit.protocols.servers.intervals import MessageStreams
+from aerokit.protocols.servers.parameters import DefinedParameterServer
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
 from aerokit.sim.faults import Faults
@@ -216,16 +216,14 @@ class ExtendedParameters(DefinedParameterServer):
     Values survive a reboot. ``mute_parameters`` and ``parameter_limits`` of the component's faults apply.
     """
 
-    def __init__(self, component: SimulatedComponent, definition: CameraDefinition) -> None:
-        self._component = component
-        super().__init__(component, definition)
+    _host: SimulatedComponent  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def send(self, name: str, index: int, channel: Channel | None) -> None:
-        if name not in self._component.faults.mute_parameters:
+        if name not in self._host.faults.mute_parameters:
             super().send(name, index, channel)
 
     def limited(self, name: str, value: SettingValue) -> SettingValue:
-        low, high = self._component.faults.parameter_limits.get(name, (None, None))
+        low, high = self._host.faults.parameter_limits.get(name, (None, None))
         if low is not None and high is not None and isinstance(value, (int, float)):
             return type(value)(max(low, min(high, value)))
         return value

@@ -59,6 +59,8 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         attitude_rate_hz: float = 5.0,
     ) -> None:
         super().__init__(component_id, system_id=system_id)
+        self.host: ServerHost = self
+        self.device_id: int = component_id
         self.limits: tuple[tuple[float, float], ...] = tuple(
             (math.radians(low), math.radians(high)) for low, high in (roll_deg, pitch_deg, yaw_deg)
         )
@@ -99,14 +101,6 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
 
     def listen(self) -> None:
         listen_for_gimbal(self)
-
-    @property
-    def host(self) -> ServerHost:
-        return self
-
-    @property
-    def device_id(self) -> int:
-        return self.component_id
 
     def home_altitude_m(self) -> float:
         pose = pose_of(self.vehicle)

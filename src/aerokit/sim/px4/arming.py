@@ -188,12 +188,8 @@ class Px4Arming:
 
     @property
     def is_possible(self) -> bool:
-        return self._px4.is_ready and self._mode_allows and not self.reasons()
-
-    @property
-    def _mode_allows(self) -> bool:
-        mode = self._px4.mode
-        return modes.MODES[mode].can_arm and self._px4.can_run(mode)
+        px4, mode = self._px4, self._px4.mode
+        return px4.is_ready and modes.MODES[mode].can_arm and px4.can_run(mode) and not self.reasons()
 
     def arm(self, by: str = "external command") -> bool:
         """Arm and return True, or report the failed checks and return False."""

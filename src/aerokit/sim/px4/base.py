@@ -16,7 +16,7 @@ from aerokit.mavlink.signing import SigningKey
 from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
-from aerokit.sim.logs import SimulatedLog
+from aerokit.sim.logs import DEFAULT_LOGS, SimulatedLog
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
@@ -33,12 +33,11 @@ from aerokit.sim.px4.mission_server import Px4MissionServer
 from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.offboard import Px4Offboard
 from aerokit.sim.px4.payload import Px4CameraTrigger, Px4Gimbal
-from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Px4Storage, px4_parameters
+from aerokit.sim.px4.storage import Px4Signing, Px4Storage, px4_parameters
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
 # Shares of the boot time after which the streams start, and pre-arm warnings are sent.
 _HEARTBEAT_BOOT_SHARE, _WARNING_BOOT_SHARE = 0.2, 0.3
-_REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
 _AMPERES_AT_FULL = 40.0
@@ -149,8 +148,8 @@ class Px4Vehicle(Px4Host):
         self._has_flown = False  # True after a take-off, until the vehicle is armed again
         self.flight: Px4Flight = self._make_flight()
         self.mission: Px4Mission = self._make_mission()
-        self.failsafes: Px4Failsafes = Px4Failsafes(self)
         self.text_links: Px4TextLinks = Px4TextLinks(self)
+        self.failsafes: Px4Failsafes = Px4Failsafes(self, self.text_links)
         self.missions.reset()
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:
@@ -168,7 +167,6 @@ class Px4Vehicle(Px4Host):
         self.log_stream: Px4LogStream = Px4LogStream(self)
         self.commands: CommandServer = self.serve_commands(self.make_commands())
         self.on(m.Ping, self._on_ping)
-        self.missions.listen()
 
     @property
     def airspeed_m_s(self) -> float:
@@ -198,7 +196,6 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()  # A reboot has created a new `failsafes`.
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 
@@ -217,9 +214,6 @@ class Px4Vehicle(Px4Host):
         ready_at = max(self.now, self.booted_at + self._boot_time_s)
         # PX4 does not stream the origin, but sends it once, and again after a change.
         self.call_at(ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel))
-
-    def restart(self) -> None:
-        self.reboot(_REBOOT_SILENCE_S)
 
     def reboot(self, silence_s: float) -> None:
         self.motion.down = self.motion.ground_down

@@ -110,9 +110,12 @@ _BEFORE_INT32_MAX, _AFTER_INT32_MAX = 2.0**31 - 128, 2.0**31 + 256
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    flight = _FlightCommands(px4)
+    flight, requests = _FlightCommands(px4), _MessageRequests(px4)
     return {
-        **message_requests(px4),
+        Cmd.REQUEST_MESSAGE: requests.request_message,
+        Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
+        Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
+        **{command: partial(requests.send_now, message) for command, message in _LEGACY_REQUESTS.items()},
         **other_commands(px4),
         **px4.camera_trigger.commands(),
         **gimbal_commands(px4.gimbal),
@@ -120,14 +123,14 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.DO_SET_MODE: flight.set_mode,
         Cmd.NAV_TAKEOFF: flight.take_off,
         Cmd.DO_SET_STANDARD_MODE: flight.set_standard_mode,
-        Cmd.NAV_LAND: flight.land,
-        Cmd.NAV_LAND_LOCAL: flight.land_precisely,
+        Cmd.NAV_LAND: lambda _: flight.change_to(modes.LAND, "Landing at current position"),
+        Cmd.NAV_LAND_LOCAL: lambda _: flight.change_to(modes.PRECISION_LAND, "Precision landing"),
         Cmd.DO_ORBIT: flight.orbit,
         Cmd.DO_VTOL_TRANSITION: flight.transition,
         Cmd.DO_AUTOTUNE_ENABLE: flight.tune,
         Cmd.DO_CHANGE_ALTITUDE: flight.change_altitude,
         Cmd.DO_FLIGHTTERMINATION: flight.terminate,
-        Cmd.NAV_RETURN_TO_LAUNCH: flight.return_to_launch,
+        Cmd.NAV_RETURN_TO_LAUNCH: lambda _: flight.change_to(modes.RTL, "Returning to launch"),
         Cmd.DO_REPOSITION: flight.reposition,
         Cmd.DO_CHANGE_SPEED: flight.change_speed,
         Cmd.MISSION_START: flight.start_mission,
@@ -201,7 +204,7 @@ class _FlightCommands:
             return MavResult.FAILED
         return MavResult.ACCEPTED if self._px4.change_mode(mode) else MavResult.TEMPORARILY_REJECTED
 
-    def _change(self, mode: Px4Mode, text: str = "") -> int:
+    def change_to(self, mode: Px4Mode, text: str = "") -> int:
         result = _change(self._px4, mode)
         if text and result == MavResult.ACCEPTED:
             self._px4.info(text)
@@ -209,7 +212,7 @@ class _FlightCommands:
 
     def take_off(self, command: ReceivedCommand) -> int:
         px4 = self._px4
-        result = self._change(modes.TAKEOFF)
+        result = self.change_to(modes.TAKEOFF)
         # Without an altitude, the mode TAKEOFF climbs to MIS_TAKEOFF_ALT.
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
@@ -218,15 +221,6 @@ class _FlightCommands:
                 down = px4.motion.down
             px4.flight.plan_take_off(down)
         return result
-
-    def land(self, _: ReceivedCommand) -> int:
-        return self._change(modes.LAND, "Landing at current position")
-
-    def land_precisely(self, _: ReceivedCommand) -> int:
-        return self._change(modes.PRECISION_LAND, "Precision landing")
-
-    def return_to_launch(self, _: ReceivedCommand) -> int:
-        return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
         px4 = self._px4
@@ -237,7 +231,7 @@ class _FlightCommands:
             return MavResult.DENIED
         if command.param1 >= 0 and to_int(command.param1) != px4.mission.current:
             px4.mission.set_current(to_int(command.param1))  # even if PX4 refuses the mode below (navigator_main.cpp)
-        result = self._change(modes.MISSION)
+        result = self.change_to(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
         return result
@@ -245,7 +239,7 @@ class _FlightCommands:
     def reposition(self, command: ReceivedCommand) -> int:
         if to_int(command.param2) != MavDoRepositionFlags.CHANGE_MODE:  # PX4 requires this flag, and no other flag.
             return MavResult.UNSUPPORTED
-        result = self._change(modes.HOLD)
+        result = self.change_to(modes.HOLD)
         if result != MavResult.ACCEPTED:
             return result
         if self._px4.failsafes.fence.allows(self._destination(command)):
@@ -278,7 +272,7 @@ class _FlightCommands:
         has_radius = math.isfinite(command.param1)
         # A plane has no ORBIT, but circles its target in HOLD. It ignores the speed.
         if px4.VEHICLE_TYPE == MavType.FIXED_WING:
-            result = self._change(modes.HOLD)  # sets the target to the current position
+            result = self.change_to(modes.HOLD)  # sets the target to the current position
             if result == MavResult.ACCEPTED:
                 px4.flight.target = (north, east, down)
                 px4.flight.radius_m = command.param1 if has_radius else px4.parameters["NAV_LOITER_RAD"]
@@ -288,7 +282,7 @@ class _FlightCommands:
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
             return MavResult.ACCEPTED  # PX4 checks the radius only after the acknowledgement (FlightTaskOrbit.cpp).
-        return self._change(modes.ORBIT)
+        return self.change_to(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
         px4 = self._px4
@@ -324,7 +318,7 @@ class _FlightCommands:
         return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:
-        result = self._change(modes.HOLD)
+        result = self.change_to(modes.HOLD)
         if result == MavResult.ACCEPTED and math.isfinite(command.param1):
             flight = self._px4.flight
             north, east, _ = flight.target
@@ -371,18 +365,6 @@ class _FlightCommands:
 
 _NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID, m.CurrentEventSequence.ID})
 _ACKNOWLEDGED_ONLY = frozenset({m.Heartbeat.ID})
-
-
-def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    requests = _MessageRequests(px4)
-    handlers: dict[int, CommandHandler] = {
-        Cmd.REQUEST_MESSAGE: requests.request_message,
-        Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
-        Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
-    }
-    for command, message_id in _LEGACY_REQUESTS.items():
-        handlers[command] = partial(requests.send_now, message_id)
-    return handlers
 
 
 # The message that each of these older commands requests.

@@ -17,7 +17,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.missions import FenceZones
 from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
+from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH, Px4TextLinks
 from aerokit.sim.px4.modes import AUTO, HOLD, LAND, MISSION, MODES, OFFBOARD, ORBIT, RTL, Px4Mode
 
 _NO_ACTION, _WARNING = 0, 1
@@ -43,10 +43,9 @@ class Px4Fence:
     @property
     def breaches(self) -> list[str]:
         """Texts that say how the vehicle breaches its geofence at present."""
-        motion = self._px4.motion
         if round(self._px4.parameters["GF_ACTION"]) == _NO_ACTION:
             return []
-        return self.breaches_at(motion.place)
+        return self.breaches_at(self._px4.motion.place)
 
     def allows(self, place: Ned) -> bool:
         action = round(self._px4.parameters["GF_ACTION"])
@@ -106,8 +105,8 @@ class Px4Failsafes:
 
     battery_state: MavBatteryChargeState
 
-    def __init__(self, px4: Px4Host) -> None:
-        self._px4 = px4
+    def __init__(self, px4: Px4Host, text_links: Px4TextLinks) -> None:
+        self._px4, self._text_links = px4, text_links
         self.fence: Px4Fence = Px4Fence(px4)
         self.action: FailsafeAction = Action.NONE  # The action that is being executed.
         self.battery_state = MavBatteryChargeState.OK
@@ -124,9 +123,7 @@ class Px4Failsafes:
         self._failing: frozenset[str] = frozenset()  # The causes that exist at present.
         self._holds_until = -math.inf  # end of the delay in which the vehicle holds instead of returning or landing
         self._is_overridden = False  # True after the user has changed the mode during a failsafe.
-
-    def listen(self) -> None:
-        self._px4.on(m.Heartbeat, self._on_heartbeat)
+        px4.on(m.Heartbeat, self._on_heartbeat)
 
     def start(self) -> None:
         self._px4.every(_INTERVAL_S, self.check)
@@ -138,7 +135,7 @@ class Px4Failsafes:
     def _on_heartbeat(self, beat: m.Heartbeat, channel: Channel) -> None:
         if beat.type != MavType.GCS:
             return
-        self._px4.text_links.on_station_heartbeat(channel)
+        self._text_links.on_station_heartbeat(channel)
         if not self.has_station and math.isfinite(self._station_at):
             self._px4.info("GCS connection regained")
         self.has_station = True

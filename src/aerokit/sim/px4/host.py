@@ -12,7 +12,6 @@ from typing import ClassVar, Protocol
 from aerokit.mavlink.enums import MavFrame
 from aerokit.missions import MissionItem
 from aerokit.sim.autopilot import SimulatedAutopilot
-from aerokit.sim.channel import Channel
 from aerokit.sim.motion import Ned
 from aerokit.sim.px4.modes import Px4Mode
 
@@ -49,10 +48,6 @@ class Px4FailsafesInterface(Protocol):
     @property
     def acts(self) -> bool: ...
     def arming_obstacles(self) -> list[str]: ...
-
-
-class Px4TextLinksInterface(Protocol):
-    def on_station_heartbeat(self, channel: Channel) -> None: ...
 
 
 class Px4FlightInterface(Protocol):
@@ -116,7 +111,6 @@ class Px4Host(SimulatedAutopilot):
     sticks: Px4SticksInterface
     arming: Px4ArmingInterface
     failsafes: Px4FailsafesInterface
-    text_links: Px4TextLinksInterface
     flight: Px4FlightInterface
     mission: Px4MissionInterface
     missions: Px4MissionsInterface

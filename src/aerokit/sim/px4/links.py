@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import csv
 import math
-import pkgutil
 import re
 import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from pathlib import Path
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavResult
@@ -226,7 +226,5 @@ def _interval_us(rate_hz: float) -> int:
 @lru_cache(maxsize=1)
 def _table() -> dict[str, dict[int, float]]:
     """Return the rates in Hz by link mode and message id. A message with the rate 0 is sent only on request."""
-    data = pkgutil.get_data(__name__, "stream_rates.csv")
-    assert data is not None
-    rows = list(csv.DictReader(data.decode().splitlines()))
+    rows = list(csv.DictReader(Path(__file__).with_name("stream_rates.csv").read_text("utf-8").splitlines()))
     return {mode: {int(row["message_id"]): float(row[mode]) for row in rows} for mode in LINK_MODES}

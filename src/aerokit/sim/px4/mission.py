@@ -17,15 +17,15 @@ from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
-_TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
-_LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
+TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
+LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
 _WITH_PLACE = (
     Cmd.NAV_WAYPOINT,
     Cmd.NAV_LOITER_UNLIM,
     Cmd.NAV_LOITER_TIME,
     Cmd.NAV_LOITER_TO_ALT,
-    *_TAKE_OFFS,
-    *_LANDINGS,
+    *TAKE_OFFS,
+    *LANDINGS,
 )
 # Commands that PX4 stores, but that make a mission invalid.
 _STORED_ONLY = (Cmd.CONDITION_DELAY, Cmd.CONDITION_DISTANCE, Cmd.NAV_FENCE_RETURN_POINT)
@@ -44,7 +44,7 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
             return f"item {number}: unsupported cmd: {item.command:d}"
         if item.command == Cmd.NAV_LAND and number == 1 and px4.is_landed:
             return "starts with landing"
-        if item.command in _TAKE_OFFS:
+        if item.command in TAKE_OFFS:
             _, _, down = px4.place_of(item)
             if down >= home_down:
                 return "Takeoff altitude below home altitude!"
@@ -58,8 +58,8 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # A multicopter has no MIS_TKO_LAND_REQ.
         return None
-    takes_off = any(item.command in _TAKE_OFFS for item in items)
-    lands = any(item.command in _LANDINGS for item in items)
+    takes_off = any(item.command in TAKE_OFFS for item in items)
+    lands = any(item.command in LANDINGS for item in items)
     # The default of planes is 2: a landing is required.
     required = round(px4.parameters["MIS_TKO_LAND_REQ"])
     if required == 1 and not takes_off:
@@ -84,7 +84,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
             if land_start >= 0:
                 return "more than one land start."
             land_start = index
-        elif item.command in _LANDINGS:
+        elif item.command in LANDINGS:
             if index == 0:
                 return "starts with land waypoint."
             approach = index - 1
@@ -283,9 +283,9 @@ class Px4Mission:
         north, east, down = target
         has_heading = item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
         px4.flight.heading = math.radians(item.param4) if has_heading else None
-        if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
-            self._climb(down if item.command in _TAKE_OFFS else None)
-        elif item.command in _LANDINGS:
+        if px4.is_landed or item.command in TAKE_OFFS:  # On the ground, every item begins with a climb.
+            self._climb(down if item.command in TAKE_OFFS else None)
+        elif item.command in LANDINGS:
             # Fly to the landing point at the present height; `update` then descends.
             px4.flight.target = (north, east, motion.down)
         else:
@@ -324,7 +324,7 @@ class Px4Mission:
             return
         if math.isnan(self._arrived_at):
             self._arrived_at = self._px4.now
-        if item.command in _LANDINGS:
+        if item.command in LANDINGS:
             self._phase = "land"
             self._mark_reached()
         elif self._is_done(item):

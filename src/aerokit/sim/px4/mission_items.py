@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import csv
 import math
-import pkgutil
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame as Frame
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavRoi
 from aerokit.missions import MissionItem
+from aerokit.protocols.servers.missions import ItemRefused
 from aerokit.sim.commands import to_int
 from aerokit.sim.missions import POLYGON_CORNERS, float32
 
-_DATA = pkgutil.get_data(__name__, "mission_commands.csv")
-assert _DATA is not None
-_ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
+_ROWS = list(csv.DictReader(Path(__file__).with_name("mission_commands.csv").read_text("utf-8").splitlines()))
 # Storage types (see `_CONVERSIONS`) of params 1 to 4 of each command that is allowed in a global frame.
 _COMMANDS_WITH_PLACE = {int(Cmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
 # Commands that are allowed in MAV_FRAME_MISSION. All their seven params are stored.
@@ -38,8 +37,8 @@ _TURN = float32(math.tau)
 _RADIANS_PER_DEGREE, _DEGREES_PER_RADIAN = float32(_PI / 180.0), float32(180.0 / _PI)
 
 
-def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
-    """Return the item as PX4 stores it (with frame 0, 2 or 3), or the MAV_MISSION_RESULT of a refusal.
+def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem:
+    """Return the item as PX4 stores it (with frame 0, 2 or 3). Raises ItemRefused.
 
     ``is_int`` is True for an item of a MISSION_ITEM_INT. PX4 accepts the frames 5 and 6 only in this message.
     """
@@ -49,14 +48,12 @@ def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> M
     elif frame == Frame.MISSION:
         stored_item = _without_place(item)
     else:
-        return MavMissionResult.UNSUPPORTED_FRAME
-    if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-        return stored_item
+        raise ItemRefused(MavMissionResult.UNSUPPORTED_FRAME)
     if mission_type == MavMissionType.MISSION and stored_item.command in _NO_MISSION_COMMANDS:
-        return MavMissionResult.ERROR
+        raise ItemRefused(MavMissionResult.ERROR)
     if mission_type == MavMissionType.FENCE:
         if stored_item.command in POLYGON_CORNERS and stored_item.param1 < 3:
-            return MavMissionResult.ERROR
+            raise ItemRefused(MavMissionResult.ERROR)
         return _as_fence_point(stored_item)
     return stored_item
 
@@ -89,23 +86,23 @@ def _as_fence_point(item: MissionItem) -> MissionItem:
     return MissionItem(item.command, Frame.GLOBAL, item.param1, **place, autocontinue=False)
 
 
-def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
+def _with_place(item: MissionItem, frame: int) -> MissionItem:
     layout = _COMMANDS_WITH_PLACE.get(item.command)
     if layout is None:
-        return MavMissionResult.UNSUPPORTED
+        raise ItemRefused(MavMissionResult.UNSUPPORTED)
     command = item.command
     if command in _ROI_COMMANDS:
         if to_int(item.param1) not in _ROI_WITH_PLACE:
-            return MavMissionResult.INVALID_PARAM1
+            raise ItemRefused(MavMissionResult.INVALID_PARAM1)
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     params = (item.param1, item.param2, item.param3, item.param4)
     p1, p2, p3, p4 = (_CONVERSIONS[type_](param) for type_, param in zip(layout, params, strict=True))
     return item.replace(command=command, frame=frame, param1=p1, param2=p2, param3=p3, param4=p4)
 
 
-def _without_place(item: MissionItem) -> MissionItem | int:
+def _without_place(item: MissionItem) -> MissionItem:
     if item.command not in _COMMANDS_WITHOUT_PLACE:
-        return MavMissionResult.UNSUPPORTED
+        raise ItemRefused(MavMissionResult.UNSUPPORTED)
     p1, p2, command = item.param1, item.param2, item.command
     if command == Cmd.DO_JUMP:  # PX4 stores the target as int16 and the number of repetitions as uint16.
         target = to_int(p1) & 0xFFFF
@@ -114,7 +111,7 @@ def _without_place(item: MissionItem) -> MissionItem | int:
         p1, p2 = float(target), float(to_int(p2) & 0xFFFF)
     if command in _ROI_COMMANDS:
         if to_int(p1) not in _ROI_WITHOUT_PLACE:
-            return MavMissionResult.INVALID_PARAM1
+            raise ItemRefused(MavMissionResult.INVALID_PARAM1)
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     # PX4 stores x and y as floats, and rounds them to integers for a download (mavlink_mission.cpp).
     x, y = _rounded(float32(item.x)), _rounded(float32(item.y))

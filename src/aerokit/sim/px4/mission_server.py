@@ -20,11 +20,11 @@ from aerokit.protocols.servers.missions import (
     AnyItem,
     AnyListMessage,
     AnyRequest,
+    ItemRefused,
     ListUpload,
     MissionServer,
     item_from,
-    item_message_float,
-    item_message_int,
+    item_message,
 )
 from aerokit.sim.channel import Channel
 from aerokit.sim.px4.host import Px4Host
@@ -89,21 +89,15 @@ class Px4MissionServer(MissionServer):
         # PX4 itself does not store lists from files.
         if mission_type not in _CAPACITIES or start or not clear:
             return Result.ERROR
-        stored_items: list[MissionItem] = []
-        for item in items:
-            stored_item = as_stored(item, mission_type)
-            if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-                return stored_item
-            stored_items.append(stored_item)
+        try:
+            stored_items = [as_stored(item, mission_type) for item in items]
+        except ItemRefused as refused:
+            return refused.result
         self._store_if_changed(mission_type, stored_items, checksum(items))
         return Result.ACCEPTED
 
     def capacity(self, mission_type: int) -> int:
         return _CAPACITIES.get(mission_type, 0)
-
-    def item(self, mission_type: int, seq: int) -> MissionItem | None:
-        item = self._item(mission_type, seq)
-        return None if isinstance(item, int) else item
 
     @property
     def commands(self) -> Sequence[MissionItem]:
@@ -156,13 +150,10 @@ class Px4MissionServer(MissionServer):
         client, kind = link.client, link.mission_type
         is_current = self._px4.mission.current == seq
         downloaded = as_downloaded(item, as_int=link.uses_int)
-        if link.uses_int:
-            message: AnyItem = item_message_int(downloaded, seq, client, kind, current=is_current)
-        else:
-            # In MAV_FRAME_MISSION, x and y are not coordinates. In other frames, they are stored as degrees times 1e7.
-            scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7
-            place = (item.x * scale, item.y * scale)
-            message = item_message_float(downloaded, place, seq, client, kind, int(is_current))
+        # In MAV_FRAME_MISSION, x and y are not coordinates. In other frames, they are stored as degrees times 1e7.
+        scale = 1.0 if item.frame == MavFrame.MISSION else 1e-7
+        place = (item.x * scale, item.y * scale)
+        message = item_message(downloaded, seq, client, kind, as_int=link.uses_int, current=is_current, place=place)
         self._px4.send(message, link.channel)
 
     def _schedule_check(self, upload: ListUpload) -> None:
@@ -289,7 +280,7 @@ class Px4MissionServer(MissionServer):
             self._warn(f"IGN MISSION_ITEM: {reason}")
             self._answer(link, Result.ERROR)
 
-    def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
+    def _store_item(self, upload: ListUpload, message: AnyItem) -> None:
         link = self._link(upload.channel)
         item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
@@ -297,18 +288,17 @@ class Px4MissionServer(MissionServer):
         # A MISSION_ITEM has latitude and longitude in degrees instead of degrees times 1e7.
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
-        stored_item = as_stored(item_in_e7, link.mission_type, is_int=is_int)
-        if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
-            if stored_item != Result.ERROR:
+        try:
+            link.items.append(as_stored(item_in_e7, link.mission_type, is_int=is_int))
+        except ItemRefused as refused:
+            if refused.result != Result.ERROR:
                 self._warn("IGN MISSION_ITEM: Invalid item")
-            return stored_item
+            raise
         # The checksum covers the item as received, so x and y of a MISSION_ITEM must be floats.
         received = item if is_int else item.replace(x=float(item.x), y=float(item.y))
         link.opaque_id = checksum([received], link.opaque_id)
-        link.items.append(stored_item)
         if message.current:
             link.current = message.seq
-        return Result.ACCEPTED
 
     def _finish(self, upload: ListUpload) -> None:
         link = self._link(upload.channel)

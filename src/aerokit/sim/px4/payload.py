@@ -67,10 +67,6 @@ class Px4Gimbal:
             self._px4.every(_POLL_INTERVAL_S, self._poll_return)
 
     @property
-    def own_ids(self) -> tuple[int, int]:
-        return self._px4.system_id, self._px4.component_id
-
-    @property
     def is_from_north(self) -> bool:
         return self._place is not None or bool(self._flags & Flags.YAW_LOCK)
 
@@ -126,6 +122,15 @@ class Px4Gimbal:
         frame = self._px4.frame
         self._place = (*frame.to_local(latitude_e7, longitude_e7), frame.origin.altitude_m - altitude_m)
 
+    def configure(self, command: ReceivedCommand) -> int:
+        system, component = self.in_control
+        sender_system, sender_component = command.sender
+        self.in_control = (
+            _id_in_control(to_int(command.param1), system, self._px4.system_id, sender_system),
+            _id_in_control(to_int(command.param2), component, self._px4.component_id, sender_component),
+        )
+        return MavResult.ACCEPTED
+
     def _poll_return(self) -> None:
         is_going_home = self._px4.mode == RTL
         if is_going_home and not self._was_returning:
@@ -139,9 +144,7 @@ class Px4Gimbal:
         angles, rates = angles_and_rates(message)
         self.apply(message.flags, angles, rates)
 
-    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
-        if not self.is_fitted:
-            return None
+    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus:
         quaternion = quaternion_from_euler(*self.angles())
         return m.GimbalDeviceAttitudeStatus(
             target_system=0, target_component=0, time_boot_ms=self._px4.time_boot_ms, flags=self.flags, q=quaternion,
@@ -149,15 +152,11 @@ class Px4Gimbal:
             delta_yaw_velocity=0.0, gimbal_device_id=_DEVICE_ID,
         )  # fmt: skip
 
-    def manager_information(self) -> m.GimbalManagerInformation | None:
-        if not self.is_fitted:
-            return None
+    def manager_information(self) -> m.GimbalManagerInformation:
         limits = [math.radians(limit) for low_and_high in _LIMITS for limit in low_and_high]
         return m.GimbalManagerInformation(self._px4.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
-    def manager_status(self) -> m.GimbalManagerStatus | None:
-        if not self.is_fitted:
-            return None
+    def manager_status(self) -> m.GimbalManagerStatus:
         no_secondary = (0, 0)
         return m.GimbalManagerStatus(self._px4.time_boot_ms, self.flags, _DEVICE_ID, *self.in_control, *no_secondary)
 
@@ -173,25 +172,13 @@ def _if_fitted(device: Px4Gimbal | Px4CameraTrigger, handler: CommandHandler) ->
 
 def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
     return {
-        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: _if_fitted(gimbal, partial(_configure, gimbal)),
+        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: _if_fitted(gimbal, gimbal.configure),
         MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: _if_fitted(gimbal, partial(_pitch_and_yaw, gimbal)),
         MavCmd.DO_MOUNT_CONTROL: _if_fitted(gimbal, partial(_control_mount, gimbal)),
         MavCmd.DO_MOUNT_CONFIGURE: _if_fitted(gimbal, lambda _: MavResult.ACCEPTED),
         MavCmd.DO_SET_ROI_LOCATION: lambda command: _set_roi(gimbal, command),
         MavCmd.DO_SET_ROI_NONE: lambda _: _set_roi(gimbal, None),
     }
-
-
-def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    requested_system, requested_component = to_int(command.param1), to_int(command.param2)
-    system, component = gimbal.in_control
-    own_system, own_component = gimbal.own_ids
-    sender_system, sender_component = command.sender
-    gimbal.in_control = (
-        _id_in_control(requested_system, system, own_system, sender_system),
-        _id_in_control(requested_component, component, own_component, sender_component),
-    )
-    return MavResult.ACCEPTED
 
 
 def _id_in_control(requested: int, present: int, own: int, sender: int) -> int:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import pkgutil
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.mavlink.enums import MavParamType, MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat, LogEntry, LogRequestData, LogRequestList
-from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.protocols.servers.files import EINVAL, FileFault, FileHandle, FileTree
@@ -28,9 +27,7 @@ from aerokit.sim.px4.host import Px4Host
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
     """Return the parameters of a "quadrotor" or an "airplane". ``count`` limits how many are listed."""
-    data = pkgutil.get_data(__name__, f"{table}.param.csv")
-    assert data is not None
-    return SimParameters.from_text(data.decode(), count)
+    return SimParameters(Path(__file__).with_name(f"{table}.param.csv").read_text("utf-8"), count)
 
 
 class Px4ParameterMount(ParameterPackMount):
@@ -129,9 +126,6 @@ class _Writer(FileHandle):
         return True
 
 
-DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
-
-
 class Px4LogServer(LogServer):
     """PX4's log server. Log numbers start at 0, and data is sent only after a list request.
 
@@ -208,27 +202,21 @@ class Px4Signing(VehicleSigning):
     new key. Version 1.16 does not support signing.
     """
 
-    def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:
-        super().__init__(vehicle, key, timestamp)
-        self._px4 = vehicle
+    _vehicle: Px4Host  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def is_for(self, link_id: int) -> bool:
-        return not self._px4.version.startswith("1.16")
+        return not self._vehicle.version.startswith("1.16")
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        return _may_be_unsigned
+        return lambda frame: frame.message_id in _UNSIGNED
 
     def may_change(self) -> bool:
         if not self.is_for(0):
             return False
-        if self._px4.is_armed:
-            self._px4.send_text(MavSeverity.CRITICAL, "MAVLink signing: rejected while armed")
+        if self._vehicle.is_armed:
+            self._vehicle.send_text(MavSeverity.CRITICAL, "MAVLink signing: rejected while armed")
             return False
         return True
 
     def on_key_changed(self) -> None:
-        self._px4.info("MAVLink signing disabled" if self.key is None else "MAVLink signing key accepted")
-
-
-def _may_be_unsigned(frame: Frame) -> bool:
-    return frame.message_id in _UNSIGNED
+        self._vehicle.info("MAVLink signing disabled" if self.key is None else "MAVLink signing key accepted")

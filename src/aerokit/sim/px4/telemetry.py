@@ -146,10 +146,6 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
     )
 
 
-def _attitude(px4: Px4Vehicle) -> m.Attitude:
-    return m.Attitude(px4.time_boot_ms, *px4.motion.angles, *px4.motion.angular_rates)
-
-
 def _attitude_quaternion(px4: Px4Vehicle) -> m.AttitudeQuaternion:
     quaternion = quaternion_from_euler(*px4.motion.angles)
     return m.AttitudeQuaternion(px4.time_boot_ms, *quaternion, *px4.motion.angular_rates)
@@ -174,10 +170,6 @@ def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
         px4.time_boot_ms, lat=place.latitude_e7, lon=place.longitude_e7, alt=round(place.altitude_m * 1000),
         relative_alt=round(px4.altitude_m * 1000), vx=north, vy=east, vz=down, hdg=centidegrees(motion.yaw),
     )  # fmt: skip
-
-
-def _local_position(px4: Px4Vehicle) -> m.LocalPositionNed:
-    return m.LocalPositionNed(px4.time_boot_ms, *px4.motion.place, *px4.motion.velocity)
 
 
 def _altitude(px4: Px4Vehicle) -> m.Altitude:
@@ -277,18 +269,6 @@ def _vibration(px4: Px4Vehicle) -> m.Vibration:
     return m.Vibration(px4.time_boot_us, 0.0, 0.1, vibration_z, clipping_0=0, clipping_1=0, clipping_2=0)
 
 
-def _system_time(px4: Px4Vehicle) -> m.SystemTime:
-    return m.SystemTime(round(px4.unix_time * 1e6), px4.time_boot_ms)
-
-
-def _current_mode(px4: Px4Vehicle) -> m.CurrentMode:
-    return m.CurrentMode(_STANDARD.get(px4.mode, 0), modes.custom_mode(px4.mode), modes.custom_mode(px4.intended_mode))
-
-
-def _ping(px4: Px4Vehicle) -> m.Ping:
-    return m.Ping(px4.time_boot_us, px4.next_ping(), target_system=0, target_component=0)
-
-
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
     count = len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
@@ -320,11 +300,11 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.EstimatorStatus.ID: _estimator_status,
     m.ExtendedSysState.ID: _extended_sys_state,
     m.BatteryStatus.ID: _battery_status,
-    m.Attitude.ID: _attitude,
+    m.Attitude.ID: lambda px4: m.Attitude(px4.time_boot_ms, *px4.motion.angles, *px4.motion.angular_rates),
     m.AttitudeQuaternion.ID: _attitude_quaternion,
     m.AttitudeTarget.ID: _attitude_target,
     m.GlobalPositionInt.ID: _global_position,
-    m.LocalPositionNed.ID: _local_position,
+    m.LocalPositionNed.ID: lambda px4: m.LocalPositionNed(px4.time_boot_ms, *px4.motion.place, *px4.motion.velocity),
     m.Altitude.ID: _altitude,
     m.VfrHud.ID: _vfr_hud,
     m.GpsRawInt.ID: _gps_raw,
@@ -334,9 +314,11 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.ServoOutputRaw.ID: _servo_output,
     m.MissionCurrent.ID: _mission_current,
     m.Vibration.ID: _vibration,
-    m.SystemTime.ID: _system_time,
-    m.CurrentMode.ID: _current_mode,
-    m.Ping.ID: _ping,
+    m.SystemTime.ID: lambda px4: m.SystemTime(round(px4.unix_time * 1e6), px4.time_boot_ms),
+    m.CurrentMode.ID: lambda px4: m.CurrentMode(
+        _STANDARD.get(px4.mode, 0), modes.custom_mode(px4.mode), modes.custom_mode(px4.intended_mode)
+    ),
+    m.Ping.ID: lambda px4: m.Ping(px4.time_boot_us, px4.next_ping(), target_system=0, target_component=0),
     m.CurrentEventSequence.ID: lambda px4: px4.events.current(),
     **SENSOR_BUILDERS,
     **IDENTITY_BUILDERS,

@@ -34,36 +34,11 @@ def _autopilot_version(px4: Px4Vehicle) -> m.AutopilotVersion:
     )  # fmt: skip
 
 
-def _protocol_version(_: Px4Vehicle) -> m.ProtocolVersion:
-    return m.ProtocolVersion(
-        version=200, min_version=100, max_version=203, spec_version_hash=bytes(8), library_version_hash=_LIBRARY_HASH
-    )
-
-
-def _storage_information(px4: Px4Vehicle) -> m.StorageInformation:
-    return m.StorageInformation(
-        px4.time_boot_ms, storage_id=1, storage_count=1, status=StorageStatus.READY, total_capacity=_CAPACITY_MIB,
-        used_capacity=_USED_MIB, available_capacity=_CAPACITY_MIB - _USED_MIB, read_speed=0.0, write_speed=0.0,
-    )  # fmt: skip
-
-
 def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
     armed_for = px4.now - px4.arming.armed_at
     armed_at_us = int((px4.unix_time - armed_for) * 1e6) if px4.is_armed else 0
     take_off_us = 0 if px4.is_landed else armed_at_us
     return m.FlightInformation(px4.time_boot_ms, armed_at_us, take_off_us, flight_uuid=0)
-
-
-def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
-    return m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI)
-
-
-def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
-    return m.MagCalReport(
-        compass_id=0, cal_mask=0, cal_status=MagCalStatus.SUCCESS, autosaved=0, fitness=0.0, ofs_x=0.0, ofs_y=0.0,
-        ofs_z=0.0, diag_x=1.0, diag_y=1.0, diag_z=1.0, offdiag_x=0.0, offdiag_y=0.0, offdiag_z=0.0,
-        orientation_confidence=1.0, old_orientation=0, new_orientation=0, scale_factor=1.0,
-    )  # fmt: skip
 
 
 _REMOTE_ID_EPOCH = 1_546_300_800
@@ -106,12 +81,21 @@ IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.OpenDroneIdLocation.ID: _remote_location,
     m.OpenDroneIdSystem.ID: _remote_system,
     m.AutopilotVersion.ID: _autopilot_version,
-    m.MagCalReport.ID: _mag_cal_report,
-    m.StorageInformation.ID: _storage_information,
+    m.MagCalReport.ID: lambda _: m.MagCalReport(
+        compass_id=0, cal_mask=0, cal_status=MagCalStatus.SUCCESS, autosaved=0, fitness=0.0, ofs_x=0.0, ofs_y=0.0,
+        ofs_z=0.0, diag_x=1.0, diag_y=1.0, diag_z=1.0, offdiag_x=0.0, offdiag_y=0.0, offdiag_z=0.0,
+        orientation_confidence=1.0, old_orientation=0, new_orientation=0, scale_factor=1.0,
+    ),
+    m.StorageInformation.ID: lambda px4: m.StorageInformation(
+        px4.time_boot_ms, storage_id=1, storage_count=1, status=StorageStatus.READY, total_capacity=_CAPACITY_MIB,
+        used_capacity=_USED_MIB, available_capacity=_CAPACITY_MIB - _USED_MIB, read_speed=0.0, write_speed=0.0,
+    ),
     m.FlightInformation.ID: _flight_information,
-    m.ProtocolVersion.ID: _protocol_version,
-    m.ComponentMetadata.ID: _component_metadata,
-}
+    m.ProtocolVersion.ID: lambda _: m.ProtocolVersion(
+        version=200, min_version=100, max_version=203, spec_version_hash=bytes(8), library_version_hash=_LIBRARY_HASH
+    ),
+    m.ComponentMetadata.ID: lambda px4: m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI),
+}  # fmt: skip
 """Functions that build messages, by message id. A function returns None if there is nothing to send."""
 
 
@@ -216,10 +200,6 @@ def _manual_control(px4: Px4Vehicle) -> m.ManualControl:
     return m.ManualControl(px4.system_id, x=pitch, y=roll, z=throttle, r=yaw, buttons=0)
 
 
-def _timesync(px4: Px4Vehicle) -> m.Timesync:
-    return m.Timesync(0, int(px4.uptime * 1e9))
-
-
 def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None:
     if not px4.is_armed or not px4.has_position:
         return None
@@ -250,26 +230,18 @@ def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
     )
 
 
-def _link_status(px4: Px4Vehicle) -> m.LinkNodeStatus:
-    return m.LinkNodeStatus(px4.time_boot_us, *(0,) * 10)
-
-
-def _orbit_status(px4: Px4Vehicle) -> m.OrbitExecutionStatus | None:
-    return px4.flight.orbit.status() if px4.mode == ORBIT else None
-
-
 SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
-    m.LinkNodeStatus.ID: _link_status,
+    m.LinkNodeStatus.ID: lambda px4: m.LinkNodeStatus(px4.time_boot_us, *(0,) * 10),
     m.ScaledImu.ID: _scaled_imu,
     m.ScaledPressure.ID: _scaled_pressure,
     m.RcChannels.ID: _rc_channels,
     m.ManualControl.ID: _manual_control,
     m.PositionTargetGlobalInt.ID: _position_target_global,
     m.HighresImu.ID: _highres_imu,
-    m.Timesync.ID: _timesync,
+    m.Timesync.ID: lambda px4: m.Timesync(0, int(px4.uptime * 1e9)),
     m.DistanceSensor.ID: _distance_sensor,
     m.Odometry.ID: _odometry,
     m.TimeEstimateToTarget.ID: _time_estimate,
-    m.OrbitExecutionStatus.ID: _orbit_status,
+    m.OrbitExecutionStatus.ID: lambda px4: px4.flight.orbit.status() if px4.mode == ORBIT else None,
 }
 """Functions that build messages, by message id. A function returns None if there is nothing to send."""

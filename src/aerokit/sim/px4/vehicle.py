@@ -18,7 +18,7 @@ from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.commands import px4_commands, refusal_by_place, set_mode
 from aerokit.sim.px4.flight import Px4Flight
-from aerokit.sim.px4.mission import Px4Mission
+from aerokit.sim.px4.mission import LANDINGS, TAKE_OFFS, Px4Mission
 from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.telemetry import BUILDERS, GIMBAL_MESSAGES
 from aerokit.sim.vehicle import sender_of
@@ -53,8 +53,7 @@ class SimulatedPx4(Px4Vehicle):
 
     def build(self, message_id: int) -> Message | None:
         """Return the current message of this id; None if there is none."""
-        builder = BUILDERS.get(message_id)
-        return None if builder is None else builder(self)
+        return BUILDERS[message_id](self) if self.can_build(message_id) else None
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
         """Refuse an invalid position and, except in version 1.16, an unsupported frame."""
@@ -82,34 +81,36 @@ _HEIGHT_REACHED_M = 10.0
 class Px4PlaneFlight(Px4Flight):
     """Navigator of a plane. ``target`` is the center of a circle or the end of a straight line."""
 
+    _vehicle: SimulatedPx4Plane  # pyright: ignore[reportIncompatibleVariableOverride]
+
     def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
         super().__init__(plane)
         self._motion = motion
         self.radius_m: float = 0.0  # Radius of the circle; a negative radius is counter-clockwise.
         self.course: float = 0.0  # Course of the climb after take-off, in radians.
-        self._plane = plane
 
     @property
     def cruise_speed_m_s(self) -> float:
-        return self._plane.parameters["FW_AIRSPD_TRIM"]
+        return self._vehicle.parameters["FW_AIRSPD_TRIM"]
 
     @property
     def top_speed_m_s(self) -> float:
-        return self._plane.parameters["FW_AIRSPD_MAX"]
+        return self._vehicle.parameters["FW_AIRSPD_MAX"]
 
     @property
     def is_rolling(self) -> bool:
         return (
-            self.lifts_off and self._plane.now - self._plane.arming.armed_at >= self._plane.parameters["RWTO_RAMP_TIME"]
+            self.lifts_off
+            and self._vehicle.now - self._vehicle.arming.armed_at >= self._vehicle.parameters["RWTO_RAMP_TIME"]
         )
 
     def enter(self, mode: Px4Mode) -> None:
-        self.radius_m = self._plane.parameters["NAV_LOITER_RAD"]
+        self.radius_m = self._vehicle.parameters["NAV_LOITER_RAD"]
         self.course = self._motion.yaw
         super().enter(mode)
 
     def update(self) -> None:
-        plane = self._plane
+        plane = self._vehicle
         mode, mission = plane.mode, plane.mission
         self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)
         if plane.is_landed and not self.is_rolling:  # The take-off roll has not begun.
@@ -133,7 +134,7 @@ class Px4PlaneFlight(Px4Flight):
             self.circle()
 
     def _follow_sticks(self) -> None:
-        sticks, parameters = self._plane.sticks, self._plane.parameters
+        sticks, parameters = self._vehicle.sticks, self._vehicle.parameters
         climbs = sticks.pitch < 0
         climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if climbs else "FW_T_SINK_MAX"]
         min_speed, max_speed = parameters["FW_AIRSPD_MIN"], parameters["FW_AIRSPD_MAX"]
@@ -152,7 +153,7 @@ class Px4PlaneFlight(Px4Flight):
         self._motion.fly_to(*self.target, airspeed=self.speed_m_s)
 
     def climb_out(self) -> None:
-        climb = self._plane.parameters["FW_T_CLMB_MAX"]
+        climb = self._vehicle.parameters["FW_T_CLMB_MAX"]
         self._motion.head(self.course, self.speed_m_s, climb)
 
     def _take_off(self) -> None:
@@ -161,11 +162,11 @@ class Px4PlaneFlight(Px4Flight):
         if self._motion.down > target_down:
             return
         place = (self._motion.north, self._motion.east, target_down)
-        self._plane.switch_to(modes.HOLD)  # This sets the target to the current altitude.
+        self._vehicle.switch_to(modes.HOLD)  # This sets the target to the current altitude.
         self.target = place
 
     def circle_down(self) -> None:
-        sink = self._plane.parameters["FW_T_SINK_MIN"]
+        sink = self._vehicle.parameters["FW_T_SINK_MIN"]
         north, east, _ = self.target
         self.target = (north, east, self._motion.down + sink * _CLIMB_TIME_CONSTANT_S)  # makes the plane sink at `sink`
         self._land(self.circle)
@@ -180,18 +181,18 @@ class Px4PlaneFlight(Px4Flight):
         if motion.is_on_ground:
             motion.roll_out()
         elif height < _FLARE_M:  # Sink slowly at minimum speed, straight on.
-            motion.head(motion.yaw, self._plane.parameters["FW_AIRSPD_MIN"], -_FLARE_SINK_M_S)
+            motion.head(motion.yaw, self._vehicle.parameters["FW_AIRSPD_MIN"], -_FLARE_SINK_M_S)
         else:
             approach()
 
     def _glide(self) -> None:
-        motion, parameters = self._motion, self._plane.parameters
+        motion, parameters = self._motion, self._vehicle.parameters
         height = motion.distance_to(self.target) * math.tan(math.radians(parameters["FW_LND_ANG"]))
         climb = min(0.0, motion.climb_rate_to(motion.ground_down - height))
         motion.head(motion.bearing_to(self.target), parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
 
     def _return(self) -> None:
-        motion, plane = self._motion, self._plane
+        motion, plane = self._motion, self._vehicle
         if self._phase == "land":
             self.circle_down()
             return
@@ -216,11 +217,9 @@ class Px4PlaneFlight(Px4Flight):
             plane.info("RTL: land at destination")
 
     def _is_near(self) -> bool:
-        return self._motion.distance_to(self.target) <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
+        return self._motion.distance_to(self.target) <= abs(self.radius_m) + self._vehicle.parameters["NAV_ACC_RAD"]
 
 
-_TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
-_LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
 _CIRCLES = (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_LOITER_TO_ALT)
 _TURN_LEAD_S = 2.0
 
@@ -228,30 +227,28 @@ _TURN_LEAD_S = 2.0
 class Px4PlaneMission(Px4Mission):
     """Mission mode of a plane."""
 
-    def __init__(self, plane: SimulatedPx4Plane) -> None:
-        super().__init__(plane)
-        self._plane = plane
+    _px4: SimulatedPx4Plane  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _climb(self, down: float | None) -> None:
         super()._climb(down)
-        self._plane.flight.course = self._plane.motion.yaw
+        self._px4.flight.course = self._px4.motion.yaw
 
     def _set_target_for(self, item: MissionItem) -> None:
         super()._set_target_for(item)
-        flight = self._plane.flight
+        flight = self._px4.flight
         radius = 0.0
         if item.command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME):
             radius = item.param3
         elif item.command == Cmd.NAV_LOITER_TO_ALT:
             radius = item.param2
-        default = self._plane.parameters["NAV_LOITER_RAD"]
+        default = self._px4.parameters["NAV_LOITER_RAD"]
         has_radius = radius != 0.0 and math.isfinite(radius)
         flight.radius_m = radius if has_radius else default
-        if item.command in _LANDINGS:
+        if item.command in LANDINGS:
             self._phase = "land"
 
     def update(self) -> None:
-        item, flight = self._item, self._plane.flight
+        item, flight = self._item, self._px4.flight
         if item is None or self.is_finished:
             flight.circle()
         elif self._phase == "land":
@@ -259,20 +256,20 @@ class Px4PlaneMission(Px4Mission):
         elif self._phase == "climb":
             flight.climb_out()
             _, _, target_down = flight.target
-            if self._plane.motion.down <= target_down:
+            if self._px4.motion.down <= target_down:
                 self._end_climb(item)
         else:
             self._go(item)
 
     def _end_climb(self, item: MissionItem) -> None:
-        if item.command in _TAKE_OFFS:
+        if item.command in TAKE_OFFS:
             self._complete_item(item)
         else:
             self._phase = "go"
-            self._plane.flight.target = self._place(item)
+            self._px4.flight.target = self._place(item)
 
     def _go(self, item: MissionItem) -> None:
-        flight = self._plane.flight
+        flight = self._px4.flight
         if item.command in _CIRCLES or item.command == Cmd.NAV_DELAY:
             flight.circle()
         else:
@@ -280,12 +277,12 @@ class Px4PlaneMission(Px4Mission):
         if not self._is_at_target(item):
             return
         if math.isnan(self._arrived_at):
-            self._arrived_at = self._plane.now
+            self._arrived_at = self._px4.now
         if self._is_done(item):
             self._complete_item(item)
 
     def _acceptance_radius_m(self, item: MissionItem) -> float:
-        plane = self._plane
+        plane = self._px4
         # A fast plane must turn earlier.
         radius = max(plane.parameters["NAV_ACC_RAD"], _TURN_LEAD_S * plane.motion.airspeed_m_s)
         if item.command == Cmd.NAV_WAYPOINT:
@@ -294,14 +291,14 @@ class Px4PlaneMission(Px4Mission):
 
     @property
     def _height_tolerance_m(self) -> float:
-        return self._plane.parameters["NAV_FW_ALT_RAD"]
+        return self._px4.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
-        target = self._plane.flight.target
+        target = self._px4.flight.target
         super()._hold()
         # The plane flies on to the present target instead of holding here.
-        if self._plane.mode == modes.HOLD:
-            self._plane.flight.target = target
+        if self._px4.mode == modes.HOLD:
+            self._px4.flight.target = target
 
 
 _AMPERES_AT_FULL = 20.0
