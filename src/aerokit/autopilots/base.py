@@ -266,6 +266,8 @@ class Autopilot:
     """True if the client chooses the number of a MAVFTP session, False if the vehicle chooses it."""
     has_upper_case_parameters = False
     """True if parameters are always reported in upper case."""
+    plan_size_parameters: frozenset[str] = frozenset()
+    """Parameters with the number of stored plan items. Setting one of them erases items, or makes old ones valid."""
     log_suffix = ".log"
     """Suffix of flight log files: ``.bin`` (dataflash) or ``.ulg``."""
     log_directories: ClassVar[tuple[str, ...]] = ()

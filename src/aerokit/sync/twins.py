@@ -2228,8 +2228,9 @@ class Parameters(TwinOf["AsyncParameters"]):
         one. ``"auto"`` uses the file if the vehicle supports it and there are many changes.
 
         Results are as for :meth:`set_many`. A parameter that the vehicle does not have gets the outcome ``"failed"``
-        and a ParameterRejected; all others are set. If two names mean the same parameter, the value under the
-        vehicle's current name is used, and the other name gets no result.
+        and a ParameterRejected; all others are set. The same applies to ArduPilot's FENCE_TOTAL, MIS_TOTAL and
+        RALLY_TOTAL, because another number would erase a plan or add old items to it. If two names mean the same
+        parameter, the value under the vehicle's current name is used, and the other name gets no result.
 
         Raises:
             InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.

@@ -549,6 +549,22 @@ async def test_upload_by_file_keeps_value_set_during_read_back() -> None:
         assert simulated.parameters["RTL_ALT"] == 3000
 
 
+@pytest.mark.parametrize("method", ["ftp", "set"])
+async def test_upload_does_not_change_number_of_plan_items(method: Any) -> None:
+    async with open_flight(copter()) as flight:
+        results = await flight.vehicle.parameters.upload(
+            {"FENCE_TOTAL": 7, "RALLY_TOTAL": 1, "MIS_TOTAL": 0, "RTL_ALT": 2000}, method=method
+        )
+        assert {name: result.outcome for name, result in results.items()} == {
+            "FENCE_TOTAL": "failed",
+            "RALLY_TOTAL": "failed",
+            "MIS_TOTAL": "unchanged",
+            "RTL_ALT": "set",
+        }
+        assert isinstance(results["FENCE_TOTAL"].error, ParameterRejected)
+        assert [flight.copter.parameters[name] for name in ("FENCE_TOTAL", "RALLY_TOTAL", "RTL_ALT")] == [0, 0, 2000]
+
+
 async def test_upload_by_file_has_each_parameter_once(monkeypatch: pytest.MonkeyPatch) -> None:
     uploaded: list[Parameter] = []
 

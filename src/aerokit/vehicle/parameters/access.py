@@ -76,6 +76,10 @@ class ParameterAccess:
     def has_upper_case_names(self) -> bool:
         return self._transfers.autopilot.has_upper_case_parameters
 
+    @property
+    def plan_size_parameters(self) -> frozenset[str]:
+        return self._transfers.autopilot.plan_size_parameters
+
     def forget(self) -> None:
         self.store.forget()
         self._has_file = None

@@ -309,9 +309,16 @@ class ParameterWriter:
         if upload is None:  # `write` sends each name once, even if two plans have it, and skips no unchanged value.
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
         # Two names may mean the same parameter, which must be in the file only once.
-        changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}.values()
-        unchanged: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_unchanged}
-        return unchanged | await self._access.write_file(changed, upload, idle_timeout_s, on_progress)
+        changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}
+        answers: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_unchanged}
+        # The values of a file may be those of another vehicle, or of a time when this one had other plans.
+        for name in changed.keys() & self._access.plan_size_parameters:
+            del changed[name]
+            answers[name] = ParameterRejected(
+                f"{name} was not sent: it is the number of stored plan items, which only the upload of a plan changes",
+                name=name,
+            )
+        return answers | await self._access.write_file(changed.values(), upload, idle_timeout_s, on_progress)
 
     def _plan_writes(
         self,
