@@ -292,7 +292,7 @@ def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -
 
 @checks_arguments
 class Shows(Travel):
-    """Actions of a fleet that fly shows."""
+    """Actions with which a fleet flies shows."""
 
     def show_start_positions(self, show: Show, origin: Position) -> dict[str, Position]:
         """Return the position of each member at the start of a show.

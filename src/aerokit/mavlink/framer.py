@@ -260,7 +260,7 @@ class PythonFramer:
         end_of_data = (size, _NOISE, size)  # decides about an unknown frame at the end of the data
         for position, verdict, end in chain(scan.candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
-                # No valid frame begins inside the unknown frame. It is accepted if a frame or the data's end follows.
+                # No valid frame begins inside the unknown frame. Skip it whole if a frame or nothing follows.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._count_skipped(begin, unknown_begin, bad_crcs)
                     self._skip_unknown(data, unknown_begin, unknown_end)

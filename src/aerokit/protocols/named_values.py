@@ -165,7 +165,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._proceed(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process an answer. Other messages, and messages of other components, are ignored."""
+        """Process a message. Only those from the target component count."""
         if not self.done and self._is_from_target(message):
             self._on_message(message, now)
             self._proceed(now)

@@ -227,7 +227,7 @@ class _Reader(FileHandle):
             raise FileFault(EINVAL)
         self._block = block or 0  # The block size; 0 means that the first read determines the size.
         is_px4 = block is not None
-        self._whole_defaults = is_px4  # PX4 keeps a value and its default in the same block.
+        self._keeps_default_in_block = is_px4  # PX4 keeps a value and its default in the same block.
         self._content: bytes | None = None  # the whole file; None before the first read
 
     @property
@@ -244,7 +244,7 @@ class _Reader(FileHandle):
                 count=self._count,
                 with_defaults=bool(self._with_defaults),
                 block_size=self._block,
-                whole_defaults=self._whole_defaults,
+                whole_defaults=self._keeps_default_in_block,
             )
         except InvalidArgument:
             raise FileFault(EINVAL) from None

@@ -53,7 +53,7 @@ class FlightScheduler(SimulatedVehicle):
         """Do nothing."""
 
     def start_channel(self, channel: Channel) -> None:
-        """Send nothing."""
+        """Do nothing: a stage sends no first messages to a new client."""
 
     def do(self, action: Callable[[], None], *, after_s: float) -> None:
         """Run an action after ``after_s`` simulated seconds. 0 means at once."""

@@ -166,7 +166,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 class SimulatedCopter(CopterHost):
     """ArduCopter, as far as a client can observe it. `Motion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. The copter has 1,349 parameters. MNT1_TYPE 1 fits a 3-axis gimbal.
+    Takes the arguments of `ArduPilotVehicle`. The copter has 1,349 parameters. MNT1_TYPE = 1 adds a 3-axis gimbal.
 
     Not simulated: braking before a fence, the terrain failsafe.
     """

@@ -149,8 +149,8 @@ class Settings:
                 uri = (await self._request_information()).cam_definition_uri
             if not uri:
                 raise NotSupported(
-                    f"component {self._transfers.component_id} names no definition file; its settings can be read and"
-                    " set without one"
+                    f"component {self._transfers.component_id} names no definition file, so there is none to fetch; its"
+                    " settings can be read and set by name"
                 )
             data = await fetch(uri, self._files_of, self._transfers.component_id, idle_timeout_s)
             return self.load(parse_definition(data, uri), locale=locale)
