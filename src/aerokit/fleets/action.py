@@ -273,7 +273,7 @@ class FleetAction:
             raise OperationRejected(f"{self.name}: {name} is {member.status}")
         # A landing is sent even to a member that was unavailable during the wait.
         if member.absences > absences and not self._ends_flight:
-            raise OperationRejected(f"{self.name}: {name} was unavailable while it waited for its turn; no order was sent")
+            raise OperationRejected(f"{self.name}: {name} was unavailable while it waited to start; no order was sent")
         late_s = connection.now() - began_at - delay_s
         if self._corridors is not None and late_s > self._corridors.slack_s:
             raise OperationRejected(f"{self.name}: {name} would start {late_s:.1f} s late, so it stays where it is")
