@@ -61,7 +61,8 @@ class Stage:
     """A fake connection, and the messages of a vehicle on it."""
 
     def __init__(self) -> None:
-        self.at, self.slept_s, self.counted, self.bytes = 0.0, 0.0, (0, 0), 0
+        self.at, self.counted, self.bytes = 0.0, (0, 0), 0
+        self.sleeps = list[tuple[float, float]]()  # (time of waking up, seconds)
         self.bus, self.boot_clocks, self.sent = Bus(), dict[tuple[int, int], Any](), list[Message]()
         self.connection = cast(
             "Connection",
@@ -70,7 +71,7 @@ class Stage:
                 boot_clocks=self.boot_clocks,
                 now=lambda: self.at,
                 counts=lambda _: self.counted,
-                _slept_since=lambda _: self.slept_s,
+                _slept_since=lambda at: sum(seconds for woke_at, seconds in self.sleeps if woke_at > at),
                 statistics=lambda: [SimpleNamespace(bytes=self.bytes)],
                 send=lambda message, to: self.sent.append(message),
                 hold_back=self._hold_back,
@@ -86,6 +87,11 @@ class Stage:
             self.held_back = None
 
         return deliver_again
+
+    def sleep(self, seconds: float) -> None:
+        """Suspend the computer. The clock of the event loop stands still."""
+        self.at += 0.1
+        self.sleeps.append((self.at, seconds))
 
     def receive(self, message: Message, *, component_id: int = 1, received_at: float | None = None) -> None:
         encoder = self.encoder if component_id == 1 else FrameEncoder(1, component_id)
@@ -276,8 +282,20 @@ def test_late_message_before_lost_link_is_no_reboot(first_late_s: float, last_wa
 
 def test_time_asleep_during_lost_link_is_no_reboot() -> None:
     stage = watched_without_link()
-    stage.slept_s = 3600.0
+    stage.sleep(3600.0)
     assert [stage.clock(1000 * running_s, after=10.0) for running_s in (3660, 3670, 3680)] == [0, 0, 0]
+
+
+def test_sleep_before_lost_link_does_not_change_clock_speed() -> None:
+    """The computer slept for an hour while the vehicle was connected, and its own clock stood still."""
+    stage = Watched()
+    stage.clock(40_000, after=10.0)
+    stage.sleep(3600.0)
+    for running_s in (3650, 3660):
+        stage.clock(1000 * running_s, after=10.0)
+    assert stage.boot_clocks[1, 1](stage.at + 1.0) == pytest.approx(3_661_000, abs=1)
+    stage.lose_link()
+    assert [stage.clock(1000 * running_s, after=10.0) for running_s in (3670, 3680)] == [0, 0]
 
 
 def test_late_messages_after_lost_link_are_no_reboot() -> None:

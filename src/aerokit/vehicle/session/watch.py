@@ -92,8 +92,7 @@ class _LostClock(NamedTuple):
     is_speed_known: bool  # False if real time is only assumed
 
 
-def _is_real_time(first: _ClockReading, last: _ClockReading) -> bool:
-    span_s = last.read_at - first.read_at
+def _is_real_time(first: _ClockReading, last: _ClockReading, span_s: float) -> bool:
     tolerance_s = REAL_TIME_TOLERANCE_S + REAL_TIME_TOLERANCE_RATIO * span_s + first.waited_s + last.waited_s
     return abs((last.milliseconds - first.milliseconds) / 1000 - span_s) <= tolerance_s
 
@@ -194,7 +193,8 @@ class VehicleWatch:
         last = self._last_readings.get(BOOT_CLOCK)
         if last is None or BOOT_CLOCK not in self._first_readings:
             return None
-        return (last.milliseconds + self._clock_speed() * (now - last.read_at)) % BOOT_CLOCK_RANGE_MS
+        age_s = now - last.read_at + self._connection._slept_since(last.read_at)
+        return (last.milliseconds + self._clock_speed() * age_s) % BOOT_CLOCK_RANGE_MS
 
     def _clock_speed(self, clock: str = BOOT_CLOCK) -> float:
         """Return how many milliseconds this clock of the vehicle advances in a second."""
@@ -202,7 +202,13 @@ class VehicleWatch:
         # The clock of a simulation may be faster than real time.
         if first is None or last is None or last.read_at - first.read_at <= CLOCK_SPAN_S:
             return 1000.0
-        return (last.milliseconds - first.milliseconds) / (last.read_at - first.read_at)
+        return (last.milliseconds - first.milliseconds) / self._span_s(first, last)
+
+    def _span_s(self, first: _ClockReading, last: _ClockReading) -> float:
+        """Return the seconds between two readings."""
+        # While the computer sleeps, our clock stands still.
+        slept_since = self._connection._slept_since
+        return last.read_at - first.read_at + slept_since(first.read_at) - slept_since(last.read_at)
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
@@ -264,12 +270,12 @@ class VehicleWatch:
             last = self._last_readings[clock]
             if last.milliseconds > MAX_RUNNING_TIME_MS:
                 continue
-            span_s = last.read_at - first.read_at
+            span_s = self._span_s(first, last)
             speed, tolerance_ratio = 1000.0, RESUME_TOLERANCE_RATIO
             if span_s - last.waited_s > CLOCK_SPAN_S:
                 speed = self._clock_speed(clock)
                 tolerance_ratio += (RESUME_TOLERANCE_S + first.waited_s + last.waited_s) / (span_s - last.waited_s)
-            elif not _is_real_time(first, last):
+            elif not _is_real_time(first, last, span_s):
                 return {}
             lost_clocks[clock] = _LostClock(last, speed, tolerance_ratio, is_speed_known=span_s >= MIN_CLOCK_SPAN_S)
         return lost_clocks
@@ -341,7 +347,6 @@ class VehicleWatch:
     def _is_other_boot(self, clock: str, reading: _ClockReading) -> bool:
         """Return True if the clock does not continue that from before the last loss of the link."""
         last, speed, tolerance_ratio, is_speed_known = self._lost_clocks[clock]
-        # While the computer sleeps, our clock stands still.
         away_s = reading.read_at - last.read_at + self._connection._slept_since(last.read_at)
         difference_ms = abs(reading.milliseconds - last.milliseconds - speed * away_s)
         tolerance_s = RESUME_TOLERANCE_S + last.waited_s + reading.waited_s + tolerance_ratio * away_s
