@@ -347,6 +347,24 @@ async def test_restored_link_to_other_vehicle_gets_no_rest_of_order() -> None:
             await vehicle._session.wait_for_heartbeat()
 
 
+async def test_logs_of_other_vehicle_on_restored_link_are_not_erased() -> None:
+    async with cabled_beside_other() as (_, vehicle, other, exchange):
+        entries = await vehicle.logs.list()
+        received: list[object] = []
+        other.observe(m.LogErase, lambda message, _: received.append(message))
+
+        async def exchange_soon() -> None:
+            await anyio.sleep(0.5)
+            await exchange()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(exchange_soon)
+            with pytest.raises(OperationRejected, match="same boot of the same vehicle"):
+                await vehicle.logs.erase()
+        assert not received
+        assert await vehicle.logs.list() == entries
+
+
 @pytest.mark.parametrize("transfer", ["parameters", "upload", "log"])
 async def test_transfer_does_not_mix_vehicles_of_restored_link(transfer: str) -> None:
     async with cabled_beside_other() as (_, vehicle, other, exchange):
@@ -363,7 +381,7 @@ async def test_transfer_does_not_mix_vehicles_of_restored_link(transfer: str) ->
             "log": lambda: vehicle.logs.read(entry, method="log", on_progress=on_progress),
         }
         received: list[object] = []
-        for kind in (m.MissionCount, m.MissionItemInt, m.LogRequestData, m.ParamRequestRead):
+        for kind in (m.MissionCount, m.MissionItemInt, m.MissionAck, m.LogRequestData, m.ParamRequestRead):
             other.observe(kind, lambda message, _: received.append(message))
 
         async def exchange_soon() -> None:

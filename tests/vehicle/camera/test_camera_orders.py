@@ -581,3 +581,20 @@ async def test_awaited_stop_ends_if_vehicle_block_is_left_at_once() -> None:
         await asyncio.sleep(0)  # The command is sent now, but the task that confirms it has not begun.
     with pytest.raises(ConnectionClosed, match="block of this vehicle was left"), anyio.fail_after(10):
         await stop
+
+
+async def test_block_that_ends_before_proof_after_lost_link_sends_nothing() -> None:
+    """The reopened link may lead to another vehicle. After the proof, the order to stop is sent."""
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.set_mode("video")
+        commands = commands_to(camera, STOP_VIDEO)
+        with pytest.raises(RuntimeError, match="leave"):
+            async with vehicle.camera.video():
+                deliver_again = vehicle.connection.hold_back(vehicle.system_id, lambda _: None)
+                raise RuntimeError("leave")
+        await anyio.sleep(0.5)
+        assert commands == []
+        deliver_again()
+        await anyio.sleep(5)
+        assert len(commands) == 1

@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.protocols.command import command_name
 from aerokit.vehicle.commanding.order import REBOOTED, SUPERSEDED
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -213,11 +214,15 @@ class CameraOrders:
                 if had_effect is None or attempt == MAX_ORDER_ATTEMPTS:
                     raise
 
-    def send_now(self, command: int, *params: float) -> None:
-        """Send a command once, without waiting for the acknowledgement."""
-        if self._component is None or not self._session.is_open:
-            return
-        self._session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
+    def send_now(self, command: int, *params: float) -> bool:
+        """Send a command once, without waiting for the acknowledgement. Return False if it was not sent."""
+        session = self._session
+        # A link that is reopened may lead to another vehicle.
+        is_held_back = session.connection.is_held_back(session.system_id)
+        if self._component is None or not session.is_open or is_held_back:
+            return False
+        session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
+        return True
 
     async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
         """Send the stop command of an operation, and repeat it in the background until it is acknowledged.
@@ -227,13 +232,13 @@ class CameraOrders:
         """
         if not order.is_newest or self._session.is_closed:
             return
-        self.send_now(command, *params)
+        was_just_sent = self.send_now(command, *params)
         failure: AerokitError | None = None
 
         async def confirm() -> None:
             nonlocal failure
             try:
-                await self._confirm_stop(order, command, *params, is_awaited=is_awaited)
+                await self._confirm_stop(order, command, *params, is_awaited=is_awaited, was_just_sent=was_just_sent)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:
@@ -250,12 +255,17 @@ class CameraOrders:
         if failure is not None:
             raise failure
 
-    async def _confirm_stop(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
-        """Wait for the acknowledgement of a stop command that was just sent, and repeat the command if necessary."""
+    async def _confirm_stop(
+        self, order: Order, command: int, *params: float, is_awaited: bool, was_just_sent: bool
+    ) -> None:
+        """Wait for the acknowledgement of a stop command, and repeat the command if necessary."""
+        if not was_just_sent:
+            with anyio.move_on_after(MAX_SILENCE_S if is_awaited else None):
+                await self._session.wait_for_heartbeat()
         if not order.is_newest:
             return
         try:
-            await self.command(command, *params, order=order, is_stop=True, was_just_sent=True)
+            await self.command(command, *params, order=order, is_stop=True, was_just_sent=was_just_sent)
         except CommandTimeout:
             if is_awaited:
                 raise

@@ -12,7 +12,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.files import PartFile
 from aerokit._internal.values import Snapshot
-from aerokit.errors import FileError, FileTimeout, InvalidArgument
+from aerokit.errors import FileError, FileTimeout, InvalidArgument, OperationRejected
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import LogErase
 from aerokit.protocols.blocks import Reassembly
@@ -20,6 +20,7 @@ from aerokit.protocols.exchange import IDLE_TIMEOUT_S, OnProgress
 from aerokit.protocols.logs import LOG_BLOCK
 from aerokit.vehicle.files.channel import LogChannel
 from aerokit.vehicle.files.log_stream import LogStream
+from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
     import os
@@ -211,16 +212,27 @@ class Logs:
 
         Raises:
             FileTimeout: some of the old logs still exist.
+            OperationRejected: the link was lost meanwhile, and the reopened link may lead to another vehicle.
         """
         async with self._channel.operation("erase logs", timeout):
+            watch = self._context.session.watch
+            other_boots = watch.other_boots
+
+            def raise_if_other_boot() -> None:
+                if watch.other_boots != other_boots:
+                    raise OperationRejected(f"erase logs: {OTHER_BOOT}; the first may have erased its logs")
+
             remaining = await self._entries(IDLE_TIMEOUT_S)
+            raise_if_other_boot()
             progress_at = self._transfers.connection.now()
             while remaining:
                 self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
                 await anyio.sleep(ERASE_RETRY_INTERVAL_S)
                 count_before = len(remaining)
                 # `idle_timeout_s` is long, because some boards do not answer while they erase.
-                remaining = _still_listed(remaining, await self._entries(idle_timeout_s))
+                listed = await self._entries(idle_timeout_s)
+                raise_if_other_boot()
+                remaining = _still_listed(remaining, listed)
                 now = self._transfers.connection.now()
                 if len(remaining) < count_before:
                     progress_at = now

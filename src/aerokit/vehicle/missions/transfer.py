@@ -165,6 +165,8 @@ class PlanChannel:
                 " nothing was sent"
             )
         started_at = connection.now()
+        session = self._context.session
+        other_boots = session.watch.other_boots
         try:
             return await self._context.transfers.run(exchange)
         except MissionRejected as error:
@@ -180,8 +182,10 @@ class PlanChannel:
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
             raise
         finally:
-            # If this call was cancelled, the transfer is also cancelled on the vehicle.
-            if not exchange.done and connection.is_open:
+            # If this call was cancelled, the transfer is also cancelled on the vehicle. A reopened link may lead to
+            # another vehicle, which may have a transfer with another station.
+            is_proved = session.watch.other_boots == other_boots and not connection.is_held_back(session.system_id)
+            if not exchange.done and connection.is_open and is_proved:
                 for cancellation in exchange.cancellation():
                     connection.send(cancellation)
 
