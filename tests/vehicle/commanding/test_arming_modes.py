@@ -98,7 +98,7 @@ async def test_px4_arm_during_disarming_sends_nothing() -> None:
     """The last HEARTBEAT reports armed in RTL, but the vehicle has disarmed and changed to MISSION."""
     async with open_px4() as flight:
         await interrupt_mission_by_return(flight)
-        while flight.px4.is_armed:
+        while flight.px4.is_armed:  # noqa: ASYNC110
             await anyio.sleep(0.01)
         assert flight.vehicle.is_armed
         flight.wire.clear()
@@ -126,6 +126,21 @@ async def test_px4_arm_in_take_off_mode_of_another_station_stays_on_ground() -> 
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "TAKEOFF")
         await flight.vehicle.arm()
         assert flight.px4.mode == modes.HOLD
+
+
+async def test_px4_mission_started_by_arm_command_ends_in_hold(caplog: pytest.LogCaptureFixture) -> None:
+    """Another station changes to MISSION right before the command arrives, and the vehicle flies at the next report."""
+    async with open_px4() as flight:
+        await interrupt_mission_by_return(flight)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "MISSION")
+        await flight.vehicle.set_mode("LOITER")
+        flight.px4.change_mode(modes.MISSION)
+        with pytest.raises(OperationRejected, match="mode changed to MISSION; a vehicle armed in MISSION takes off"):
+            await flight.vehicle.arm()
+        await anyio.sleep(10)
+        assert flight.px4.mode == modes.HOLD
+        assert flight.px4.is_armed
+        assert "which your program has not ordered, and flies" in caplog.text
 
 
 async def test_arm_in_flight_keeps_mode() -> None:

@@ -198,7 +198,7 @@ class CommandArbiter:
         return self.order(*modes, subjects=subjects)
 
     def has_ordered_mode(self, names: Collection[str]) -> bool:
-        """Return True if the program has ordered one of these modes since the vehicle disarmed, and no other mode since.
+        """Return True if the newest order about the mode since the vehicle disarmed was for one of these modes.
 
         An order from before the disarming does not count: it was for the last flight.
         """

@@ -134,10 +134,12 @@ class ArmingActions(VehicleBase):
         is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
         command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
-        **PX4 takes off at once if it is armed in MISSION or TAKEOFF.** When it disarms after a return that interrupted a
-        mission, it changes back to MISSION by itself. Without ``mode``, aerokit therefore changes to LOITER first, except
-        if your program has ordered MISSION or TAKEOFF since the vehicle disarmed. A PX4 that reports armed is sent no
-        command, because it may disarm and change the mode meanwhile: the next HEARTBEAT decides.
+        **PX4 takes off at once if it is armed in MISSION or TAKEOFF.** When it disarms after a return that interrupted
+        a mission, it changes back to MISSION by itself. Without ``mode``, aerokit therefore changes to LOITER first,
+        unless your program has ordered MISSION or TAKEOFF since the vehicle disarmed. If PX4 reports armed already,
+        aerokit sends no command and waits for the next HEARTBEAT, because PX4 may disarm and change the mode meanwhile.
+        If another party changes to such a mode right before the command arrives, the call raises OperationRejected;
+        aerokit then disarms the vehicle, or orders it to hold if it is flying.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
@@ -227,13 +229,25 @@ class ArmingActions(VehicleBase):
                 await self._await_armed(
                     armed=True, order=order, started=started, timeout=timeout, max_silence_s=max_silence_s
                 )
+                if self._is_in_unordered_flight_mode():  # One HEARTBEAT may report the new mode and the arming.
+                    raise OperationRejected(f"arm(): the mode changed to {self.telemetry.mode_name}")
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
             except (anyio.get_cancelled_exc_class(), AerokitError) as error:
                 is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
                 if is_watched and isinstance(error, CommandTimeout):
                     add_clause(error, self._arm_cleanup.late_arming_hint())
+                elif is_watched and isinstance(error, AerokitError) and self._is_in_unordered_flight_mode():
+                    mode = self.telemetry.mode_name
+                    add_clause(
+                        error,
+                        f"a vehicle armed in {mode} takes off: aerokit disarms it, or orders a hold if it is flying",
+                    )
                 raise
+
+    def _is_in_unordered_flight_mode(self) -> bool:
+        starting_modes = self.autopilot.modes_starting_flight
+        return self.telemetry.mode_name in starting_modes and not self._arbiter.has_ordered_mode(starting_modes)
 
     async def disarm(
         self,
@@ -313,8 +327,8 @@ class ArmingActions(VehicleBase):
     async def _is_armed_already(self, timeout: float, max_silence_s: float | None) -> bool:
         """Return True if the vehicle is armed, and needs no command. Waits for a HEARTBEAT if the last one says so.
 
-        Returns False at once if an armed vehicle may be sent the command. Otherwise, a vehicle that disarms before the
-        command arrives might have changed to a mode in which the command starts a flight.
+        A vehicle that disarms before a command arrives might change to a mode in which the command starts a flight.
+        For firmware without such modes, returns False at once.
         """
         if not self.autopilot.modes_starting_flight or not self.telemetry.is_armed:
             return False
@@ -347,11 +361,10 @@ class ArmingActions(VehicleBase):
             raise OperationRejected("arm(): the vehicle was armed and has just disarmed; nothing was sent: call again")
         return bool(armed.latest)
 
-    def _would_start_flight(self) -> bool:
-        """Return True if arming in the present mode would start a flight that the program has not ordered."""
-        mode, starting_modes = self.telemetry.mode.latest, self.autopilot.modes_starting_flight
-        is_starting = mode is not None and mode.name in starting_modes and not self.telemetry.is_armed
-        return is_starting and not self._arbiter.has_ordered_mode(starting_modes)
+    def _mode_instead_of_flight(self) -> Mode | None:
+        """Return the mode to arm in if the present one would start a flight that the program has not ordered."""
+        would_start_flight = self._is_in_unordered_flight_mode() and not self.telemetry.is_armed
+        return self.autopilot.mode_to_arm_in() if would_start_flight else None
 
     def _mode_to_arm_in(self, mode: str | int | None) -> Mode | None:
         """Return the mode to change to before arming; None to arm in the present mode."""
@@ -364,8 +377,8 @@ class ArmingActions(VehicleBase):
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return arming_mode
-        if self._would_start_flight():
-            return self.autopilot.mode_to_arm_in()
+        if (safe_mode := self._mode_instead_of_flight()) is not None:
+            return safe_mode
         # A booting vehicle still sets its mode by itself, and may undo a mode change of this program.
         is_booting = self.telemetry.system_status.latest in BOOT_STATES
         must_keep_mode = self._flight_cleanup.is_stream_open or is_booting
