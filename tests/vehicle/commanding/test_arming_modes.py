@@ -281,6 +281,20 @@ async def test_plane_in_autoland_arms_in_passive_mode() -> None:
         assert vehicle.is_armed
 
 
+@pytest.mark.parametrize(("is_ordered", "mode"), [(False, "FBWA"), (True, "TAKEOFF")])
+async def test_plane_armed_in_take_off_mode_flies_only_if_ordered(is_ordered: bool, mode: str) -> None:
+    plane = SimulatedPlane(boot_time_s=1.0)
+    async with simulated_link(plane) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        plane.set_mode(PlaneMode.TAKEOFF)
+        await vehicle.mode.wait_until(lambda mode: mode.name == "TAKEOFF")
+        if is_ordered:
+            await vehicle.set_mode("TAKEOFF")
+        await vehicle.arm()
+        assert vehicle.mode_name == mode
+        assert vehicle.is_armed
+
+
 async def test_wait_ready_names_unarmable_mode_after_the_list() -> None:
     """The mode is not missing, because arm() changes it."""
     async with open_flight() as flight:

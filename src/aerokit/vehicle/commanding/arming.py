@@ -138,6 +138,7 @@ class ArmingActions(VehicleBase):
         a mission, it changes back to MISSION by itself. Without ``mode``, aerokit therefore changes to LOITER first,
         unless your program has ordered MISSION or TAKEOFF since the vehicle disarmed. If PX4 reports armed already,
         aerokit sends no command and waits for the next HEARTBEAT, because PX4 may disarm and change the mode meanwhile.
+        The same applies to ArduPlane in TAKEOFF, which it leaves for FBWA.
         If another party changes to such a mode right before the command arrives, the call raises OperationRejected;
         aerokit then disarms the vehicle, or orders it to hold if it is flying.
 
@@ -166,7 +167,7 @@ class ArmingActions(VehicleBase):
                 may still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent). Or, before
                 it reported armed, another party changed its mode or disarmed it, or your program ordered to disarm. Or
-                a PX4 that reported armed has disarmed (nothing was sent; call again).
+                a PX4 or ArduPlane that reported armed has disarmed (nothing was sent; call again).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
