@@ -119,7 +119,7 @@ async def test_px4_arm_of_armed_vehicle_sends_nothing() -> None:
         assert flight.vehicle.is_armed
 
 
-async def test_px4_arm_in_take_off_mode_of_another_station_stays_on_ground() -> None:
+async def test_px4_arm_in_foreign_take_off_mode_stays_on_ground() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         flight.px4.change_mode(modes.TAKEOFF)
@@ -282,7 +282,7 @@ async def test_plane_in_autoland_arms_in_passive_mode() -> None:
 
 
 @pytest.mark.parametrize(("is_ordered", "mode"), [(False, "FBWA"), (True, "TAKEOFF")])
-async def test_plane_armed_in_take_off_mode_flies_only_if_ordered(is_ordered: bool, mode: str) -> None:
+async def test_plane_keeps_take_off_mode_only_if_ordered(is_ordered: bool, mode: str) -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with simulated_link(plane) as link, connect(link) as vehicle:
         await vehicle.wait_ready()
