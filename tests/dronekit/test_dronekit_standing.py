@@ -173,6 +173,19 @@ def test_px4_goto_refused_by_mode_changes_no_speed() -> None:
         assert not px4.commands()
 
 
+@pytest.mark.parametrize("is_mission_ordered", [False, True])
+def test_px4_armed_starts_only_ordered_mission(is_mission_ordered: bool) -> None:
+    """PX4 stands in MISSION after a return that interrupted a mission."""
+    mission, hold = 4 << 16 | 4 << 24, 4 << 16 | 3 << 24
+    with FlightController(autopilot=12, mode=mission) as px4, dronekit.connect(px4.address, rate=None) as vehicle:
+        if is_mission_ordered:
+            vehicle.mode = dronekit.VehicleMode("MISSION")
+        vehicle.armed = True
+        px4.wait_for_command(ARM)
+        assert px4.custom_mode == (mission if is_mission_ordered else hold)
+        assert [command.command for command in px4.commands()] == [SET_MODE, ARM]
+
+
 def test_goto_after_reboot_uses_new_home(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
     copter.report("HOME_POSITION", altitude=584_000)
     wait_for(lambda: vehicle.home_location is not None)

@@ -312,8 +312,13 @@ class Autopilot:
     """True if the autopilot's own camera supports only DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
     video_addresses_camera = False
     """True if the stream id of VIDEO_START_CAPTURE selects a camera."""
+    modes_starting_flight: frozenset[str] = frozenset()
+    """Modes in which a vehicle on the ground begins a flight as soon as it is armed."""
     arming_mode: ClassVar[str | None] = None
-    """Mode in which to arm if the current mode does not allow arming. A vehicle armed in this mode stays at rest."""
+    """Mode in which to arm if the current mode does not allow arming, or would start a flight.
+
+    A vehicle armed in this mode stays at rest.
+    """
 
     def __init__(self, vehicle_type: int) -> None:
         self.vehicle_type = vehicle_type
@@ -376,7 +381,7 @@ class Autopilot:
         return (self.mode(custom_mode, base_mode, reported_names),) if base_mode & CUSTOM_MODE_ENABLED else ()
 
     def mode_to_arm_in(self) -> Mode | None:
-        """Return a mode in which to arm if the current mode does not allow arming; None if no such mode is known."""
+        """Return the mode named ``arming_mode``; None if there is none."""
         return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:

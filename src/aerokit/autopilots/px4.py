@@ -145,6 +145,9 @@ class Px4(Autopilot):
     unarmable_modes: frozenset[str] = frozenset(
         ("FOLLOWME", "LAND", "OFFBOARD", "ORBIT", "PRECLAND", "RTL", "TERMINATION")
     )
+    # The navigator executes these modes as soon as the vehicle is armed. When a vehicle disarms, it returns to the last
+    # mode that allows arming (UserModeIntention.cpp, onDisarm): to MISSION after a return that interrupted a mission.
+    modes_starting_flight: frozenset[str] = frozenset(("MISSION", "TAKEOFF", "VTOL_TAKEOFF"))
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",

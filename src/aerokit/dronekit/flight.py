@@ -92,6 +92,9 @@ class FlightMethods(VehicleAttributes):
         Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait; :meth:`arm` waits, and
         raises the reason of a refusal. As in DroneKit, the truth of the value counts: the string ``"False"`` arms.
 
+        PX4 takes off when it is armed in MISSION or TAKEOFF. Unless your program has set such a mode since the vehicle
+        disarmed, the mode is changed to LOITER before arming.
+
         Nothing is sent if the vehicle already reports the value. There are two exceptions: an opposite order is
         pending, or the order is to disarm a silent vehicle, whose last report may be outdated.
         """

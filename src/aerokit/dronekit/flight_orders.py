@@ -108,6 +108,10 @@ async def change_mode(vehicle: AsyncVehicle, mode: Mode) -> None:
 
 async def arm_or_disarm(vehicle: AsyncVehicle, armed: bool) -> None:
     """Arm or disarm, and wait until HEARTBEAT reports the change."""
+    if armed:
+        if await vehicle._is_armed_already(ARMED_TIMEOUT_S, None):
+            return
+        await _leave_mode_starting_flight(vehicle)
     # Disarming ends orders that move the vehicle.
     topics: tuple[Subject, ...] = ("arm",) if armed else ("arm", "motion")
     try:
@@ -120,6 +124,21 @@ async def arm_or_disarm(vehicle: AsyncVehicle, armed: bool) -> None:
         if getattr(error, "was_sent", True):
             add_clause(error, "the vehicle may still execute the command, which is not monitored any more")
         raise
+
+
+async def _leave_mode_starting_flight(vehicle: AsyncVehicle) -> None:
+    """Change the mode if arming in the present one would start a flight that the program has not ordered."""
+    mode = vehicle._mode_instead_of_flight()
+    if mode is None:
+        return
+    arm_commands_before = vehicle._arbiter.arm_commands_sent
+    try:
+        await change_mode(vehicle, mode)
+    except OperationRejected:
+        if vehicle._mode_instead_of_flight() is not None:  # The program has not ordered another mode meanwhile.
+            raise
+    if vehicle._arbiter.arm_commands_sent != arm_commands_before:
+        raise OperationRejected("another arm or disarm command was given; the arm command was not sent")
 
 
 async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int, *params: float) -> None:

@@ -4376,8 +4376,13 @@ class Vehicle(VehicleTwin):
         is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
         command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
-        **PX4 takes off at once if it is armed in MISSION or TAKEOFF.** When it lands after a return that interrupted a
-        mission, it changes back to MISSION by itself. Pass ``mode="LOITER"`` to stay on the ground.
+        **PX4 takes off at once if it is armed in MISSION or TAKEOFF.** When it disarms after a return that interrupted
+        a mission, it changes back to MISSION by itself. Without ``mode``, aerokit therefore changes to LOITER first,
+        unless your program has ordered MISSION or TAKEOFF since the vehicle disarmed. If PX4 reports armed already,
+        aerokit sends no command and waits for the next HEARTBEAT, because PX4 may disarm and change the mode meanwhile.
+        The same applies to ArduPlane in TAKEOFF, which it leaves for FBWA.
+        If another party changes to such a mode right before the command arrives, the call raises OperationRejected;
+        aerokit then disarms the vehicle, or orders it to hold if it is flying.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
@@ -4386,8 +4391,8 @@ class Vehicle(VehicleTwin):
         armed right after the command and no pilot has taken over. Logger "aerokit" warns about the outcome.
 
         Args:
-            mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
-                ``take_off`` starts.
+            mode: the mode to arm in. None: the present mode; if it does not allow arming, or would start a flight, the
+                mode in which ``take_off`` starts.
             force: skip the vehicle's own arming checks, which is dangerous.
             reason: why your program arms, at most 50 bytes. Logger "aerokit" reports the reason at INFO. It is also
                 sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
@@ -4403,7 +4408,8 @@ class Vehicle(VehicleTwin):
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm. The error text says whether it
                 may still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent). Or, before
-                it reported armed, another party changed its mode or disarmed it, or your program ordered to disarm.
+                it reported armed, another party changed its mode or disarmed it, or your program ordered to disarm. Or
+                a PX4 or ArduPlane that reported armed has disarmed (nothing was sent; call again).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """

@@ -6,7 +6,7 @@ import asyncio
 
 import anyio
 import pytest
-from flight_harness import Flight, in_the_air, now, open_flight, open_px4
+from flight_harness import Flight, Px4Flight, in_the_air, now, open_flight, open_px4
 
 from aerokit import connect, missions
 from aerokit.errors import (
@@ -58,21 +58,89 @@ async def test_arm_in_unarmable_mode_raises_before_sending() -> None:
         assert not flight.wire.mode_orders()
 
 
-@pytest.mark.parametrize(("mode", "flies"), [(None, True), ("LOITER", False)])
-async def test_px4_after_interrupted_mission_flies_if_armed_in_its_mode(mode: str | None, flies: bool) -> None:
+async def interrupt_mission_by_return(flight: Px4Flight) -> None:
+    """Fly a mission, and return when another station orders it. PX4 then disarms and changes back to MISSION."""
+    vehicle = flight.vehicle
+    await vehicle.wait_ready()
+    await vehicle.arm()
+    await vehicle.take_off(5.0)
+    far = vehicle.position.value.offset(north_m=200)
+    await vehicle.mission.upload(missions.Mission([missions.waypoint(far, altitude_relative_m=20)]))
+    await vehicle.mission.start()
+    flight.px4.change_mode(modes.RTL)
+    await vehicle.mode.wait_until(lambda mode: mode.name == "RTL")
+
+
+async def test_px4_arm_after_interrupted_mission_stays_on_ground() -> None:
     async with open_px4() as flight:
-        vehicle = flight.vehicle
-        await vehicle.wait_ready()
-        await vehicle.arm()
-        await vehicle.take_off(5.0)
-        far = vehicle.position.value.offset(north_m=200)
-        await vehicle.mission.upload(missions.Mission([missions.waypoint(far, altitude_relative_m=20)]))
-        await vehicle.mission.start()
-        await vehicle.return_to_launch()
-        await vehicle.mode.wait_until(lambda present: present.name == "MISSION")
-        await vehicle.arm(mode=mode)
+        await interrupt_mission_by_return(flight)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "MISSION")
+        await flight.vehicle.arm()
+        assert flight.px4.is_armed
+        assert flight.px4.mode == modes.HOLD
+        await anyio.sleep(8)
+        assert flight.px4.is_landed
+
+
+@pytest.mark.parametrize("is_explicit", [False, True])
+async def test_px4_arm_in_ordered_mission_starts_it(is_explicit: bool) -> None:
+    async with open_px4() as flight:
+        await interrupt_mission_by_return(flight)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "MISSION")
+        if not is_explicit:
+            await flight.vehicle.set_mode("MISSION")
+        await flight.vehicle.arm(mode="MISSION" if is_explicit else None)
+        await anyio.sleep(8)
+        assert not flight.px4.is_landed
+
+
+async def test_px4_arm_during_disarming_sends_nothing() -> None:
+    """The last HEARTBEAT reports armed in RTL, but the vehicle has disarmed and changed to MISSION."""
+    async with open_px4() as flight:
+        await interrupt_mission_by_return(flight)
+        while flight.px4.is_armed:  # noqa: ASYNC110
+            await anyio.sleep(0.01)
+        assert flight.vehicle.is_armed
+        flight.wire.clear()
+        with pytest.raises(OperationRejected, match="has just disarmed; nothing was sent: call again"):
+            await flight.vehicle.arm()
+        assert not flight.wire.commands(ARM)
+        await flight.vehicle.arm()
+        assert flight.px4.mode == modes.HOLD
+
+
+async def test_px4_arm_of_armed_vehicle_sends_nothing() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        flight.wire.clear()
+        await flight.vehicle.arm()
+        assert not flight.wire.commands(ARM)
+        assert flight.vehicle.is_armed
+
+
+async def test_px4_arm_in_foreign_take_off_mode_stays_on_ground() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        flight.px4.change_mode(modes.TAKEOFF)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "TAKEOFF")
+        await flight.vehicle.arm()
+        assert flight.px4.mode == modes.HOLD
+
+
+async def test_px4_mission_started_by_arm_command_ends_in_hold(caplog: pytest.LogCaptureFixture) -> None:
+    """Another station changes to MISSION right before the command arrives, and the vehicle flies at the next report."""
+    async with open_px4() as flight:
+        await interrupt_mission_by_return(flight)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "MISSION")
+        await flight.vehicle.set_mode("LOITER")
+        flight.px4.change_mode(modes.MISSION)
+        with pytest.raises(OperationRejected, match="mode changed to MISSION; a vehicle armed in MISSION takes off"):
+            await flight.vehicle.arm()
         await anyio.sleep(10)
-        assert flight.px4.is_landed != flies
+        assert flight.px4.mode == modes.HOLD
+        assert flight.px4.is_armed
+        assert "which your program has not ordered, and flies" in caplog.text
 
 
 async def test_arm_in_flight_keeps_mode() -> None:
@@ -210,6 +278,20 @@ async def test_plane_in_autoland_arms_in_passive_mode() -> None:
         await vehicle.mode.wait_until(lambda mode: mode.name == "RTL")
         await vehicle.arm()
         assert vehicle.mode_name == "FBWA"
+        assert vehicle.is_armed
+
+
+@pytest.mark.parametrize(("is_ordered", "mode"), [(False, "FBWA"), (True, "TAKEOFF")])
+async def test_plane_keeps_take_off_mode_only_if_ordered(is_ordered: bool, mode: str) -> None:
+    plane = SimulatedPlane(boot_time_s=1.0)
+    async with simulated_link(plane) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        plane.set_mode(PlaneMode.TAKEOFF)
+        await vehicle.mode.wait_until(lambda mode: mode.name == "TAKEOFF")
+        if is_ordered:
+            await vehicle.set_mode("TAKEOFF")
+        await vehicle.arm()
+        assert vehicle.mode_name == mode
         assert vehicle.is_armed
 
 

@@ -68,6 +68,8 @@ class CommandArbiter:
         self.arm_commands_sent: int = 0
         """Number of arm and disarm commands sent."""
         self.disarm_commands_sent: int = 0
+        self.last_disarm_command_at: float = -math.inf
+        """Time of the newest command to disarm."""
         self.last_arm_command: bool | None = None
         """True if the newest of these commands arms, False if it disarms; None before the first one."""
         self.mode_settles_at: float = -math.inf
@@ -195,6 +197,14 @@ class CommandArbiter:
             self._any_mode_until = self._now() + MODE_GRACE_S
         return self.order(*modes, subjects=subjects)
 
+    def has_ordered_mode(self, names: Collection[str]) -> bool:
+        """Return True if the newest order about the mode since the vehicle disarmed was for one of these modes.
+
+        An order from before the disarming does not count: it was for the last flight.
+        """
+        order = self.latest("mode") if "mode" in self._ordered_since_disarmed else None
+        return order is not None and any(mode.name in names for mode in order.modes)
+
     def on_steering(self, callback: Callable[[], None]) -> None:
         """Register a callback that is called before each new steering order."""
         self._steering_callbacks.append(callback)
@@ -259,7 +269,7 @@ class CommandArbiter:
                 if ACTION not in previous.ending_topics:  # A change to the new order's modes is no takeover.
                     previous.accept_as_effects(modes)
         if armed is not None:
-            self._supersede_arm_commands(armed)
+            self.supersede_arm_commands(armed)
         now = self._now()
         since = now - OWN_MODES_MAX_AGE_S
         recent_modes = {custom_mode for ordered_at, custom_mode in self._ordered_modes if ordered_at > since}
@@ -305,7 +315,7 @@ class CommandArbiter:
             slept_s=partial(self.slept_since, self._now()),
         )
         if order.armed is None and armed is not None:  # `posted_order` has already done this if `order.armed` is set.
-            self._supersede_arm_commands(armed)
+            self.supersede_arm_commands(armed)
             order.arm_command_number = self.arm_commands_sent
         self._sent_commands.append(sent)
         sent_at = self._now()
@@ -328,7 +338,7 @@ class CommandArbiter:
 
     def record_own_arming(self, armed: bool) -> None:
         """Record that an arm or disarm command was sent without waiting for the acknowledgement."""
-        self._supersede_arm_commands(armed)
+        self.supersede_arm_commands(armed)
         self._record_acceptance(armed, self._now())
 
     def _record_acceptance(self, armed: bool | None, accepted_at: float) -> None:
@@ -336,11 +346,13 @@ class CommandArbiter:
             # A newer command may have been accepted before this one was abandoned.
             self._arming_accepted_at = max(self._arming_accepted_at, accepted_at)
 
-    def _supersede_arm_commands(self, armed: bool) -> None:
-        """Count a new command to arm or disarm. It ends earlier ones, which are then not sent again."""
+    def supersede_arm_commands(self, armed: bool) -> None:
+        """Count a new order to arm or disarm. It ends earlier ones, which are then not sent again."""
         self.arm_commands_sent += 1
         self.disarm_commands_sent += not armed
         self.last_arm_command = armed
+        if not armed:
+            self.last_disarm_command_at = self._now()
         self.supersede(("arm",))
         for sent in self._sent_commands:
             sent.on_newer_arm_command(armed)

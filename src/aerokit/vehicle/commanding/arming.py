@@ -21,10 +21,10 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity, MavState
 from aerokit.mavlink.messages import Statustext
-from aerokit.vehicle.commanding.arbiter import STEERING
+from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, STEERING
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
-from aerokit.vehicle.commanding.order import SUPERSEDED
+from aerokit.vehicle.commanding.order import REBOOTED, SUPERSEDED
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
 from aerokit.vehicle.commanding.sender import add_clause
 from aerokit.vehicle.state.status_text import CHUNK_LENGTH
@@ -134,8 +134,13 @@ class ArmingActions(VehicleBase):
         is None, aerokit changes the mode and sends the command a second time. In all other cases, aerokit sends the
         command only once, because a repetition might arm a vehicle that a pilot has just disarmed.
 
-        **PX4 takes off at once if it is armed in MISSION or TAKEOFF.** When it lands after a return that interrupted a
-        mission, it changes back to MISSION by itself. Pass ``mode="LOITER"`` to stay on the ground.
+        **PX4 takes off at once if it is armed in MISSION or TAKEOFF.** When it disarms after a return that interrupted
+        a mission, it changes back to MISSION by itself. Without ``mode``, aerokit therefore changes to LOITER first,
+        unless your program has ordered MISSION or TAKEOFF since the vehicle disarmed. If PX4 reports armed already,
+        aerokit sends no command and waits for the next HEARTBEAT, because PX4 may disarm and change the mode meanwhile.
+        The same applies to ArduPlane in TAKEOFF, which it leaves for FBWA.
+        If another party changes to such a mode right before the command arrives, the call raises OperationRejected;
+        aerokit then disarms the vehicle, or orders it to hold if it is flying.
 
         After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
         therefore monitors the vehicle for 15 seconds, and disarms it if this command arms it after all. The monitoring
@@ -144,8 +149,8 @@ class ArmingActions(VehicleBase):
         armed right after the command and no pilot has taken over. Logger "aerokit" warns about the outcome.
 
         Args:
-            mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
-                ``take_off`` starts.
+            mode: the mode to arm in. None: the present mode; if it does not allow arming, or would start a flight, the
+                mode in which ``take_off`` starts.
             force: skip the vehicle's own arming checks, which is dangerous.
             reason: why your program arms, at most 50 bytes. Logger "aerokit" reports the reason at INFO. It is also
                 sent to the vehicle as a STATUSTEXT right before the command, and ArduPilot writes this text into its
@@ -161,7 +166,8 @@ class ArmingActions(VehicleBase):
             CommandTimeout: there was no acknowledgement, and the vehicle did not arm. The error text says whether it
                 may still arm.
             OperationRejected: the vehicle is armed already in a mode other than ``mode`` (nothing was sent). Or, before
-                it reported armed, another party changed its mode or disarmed it, or your program ordered to disarm.
+                it reported armed, another party changed its mode or disarmed it, or your program ordered to disarm. Or
+                a PX4 or ArduPlane that reported armed has disarmed (nothing was sent; call again).
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle accepted the command but did not arm.
         """
@@ -170,6 +176,10 @@ class ArmingActions(VehicleBase):
                 f"reason = {short_repr(reason)} is not allowed: it must have at most {CHUNK_LENGTH} bytes"
             )
         arming_mode = self._mode_to_arm_in(mode)
+        if await self._is_armed_already(timeout, max_silence_s):
+            return
+        if mode is None:
+            arming_mode = self._mode_to_arm_in(mode)  # The vehicle may have disarmed meanwhile.
         if arming_mode is not None:
             await self._change_to_arming_mode(arming_mode)
         self._arm_cleanup.stop_watching()
@@ -220,13 +230,25 @@ class ArmingActions(VehicleBase):
                 await self._await_armed(
                     armed=True, order=order, started=started, timeout=timeout, max_silence_s=max_silence_s
                 )
+                if self._is_in_unordered_flight_mode():  # One HEARTBEAT may report the new mode and the arming.
+                    raise OperationRejected(f"arm(): the mode changed to {self.telemetry.mode_name}")
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
             except (anyio.get_cancelled_exc_class(), AerokitError) as error:
                 is_watched = order.was_sent and self._arm_cleanup.watch(order, was_armed)
                 if is_watched and isinstance(error, CommandTimeout):
                     add_clause(error, self._arm_cleanup.late_arming_hint())
+                elif is_watched and isinstance(error, AerokitError) and self._is_in_unordered_flight_mode():
+                    mode = self.telemetry.mode_name
+                    add_clause(
+                        error,
+                        f"a vehicle armed in {mode} takes off: aerokit disarms it, or orders a hold if it is flying",
+                    )
                 raise
+
+    def _is_in_unordered_flight_mode(self) -> bool:
+        starting_modes = self.autopilot.modes_starting_flight
+        return self.telemetry.mode_name in starting_modes and not self._arbiter.has_ordered_mode(starting_modes)
 
     async def disarm(
         self,
@@ -303,6 +325,48 @@ class ArmingActions(VehicleBase):
 
     # ------------------------------------------------------------------------ modes for arming
 
+    async def _is_armed_already(self, timeout: float, max_silence_s: float | None) -> bool:
+        """Return True if the vehicle is armed, and needs no command. Waits for a HEARTBEAT if the last one says so.
+
+        A vehicle that disarms before a command arrives might change to a mode in which the command starts a flight.
+        For firmware without such modes, returns False at once.
+        """
+        if not self.autopilot.modes_starting_flight or not self.telemetry.is_armed:
+            return False
+        armed, started, reboots = self.telemetry.armed, self.connection.now(), self._session.watch.reboots
+        replaces_disarm = self._arbiter.last_arm_command is False
+        # Until then, HEARTBEAT may not yet report the effect of an earlier command to disarm.
+        is_certain_at = max(started, self._arbiter.last_disarm_command_at + ARM_HEARTBEAT_DELAY_S)
+        self._arm_cleanup.stop_watching()
+        self._arbiter.supersede_arm_commands(True)
+
+        def is_done() -> bool:
+            reported_at = armed.updated_at if self._arbiter.is_state_recent else -math.inf
+            return reported_at > is_certain_at or (reported_at > started and not armed.latest)
+
+        def failure_reason() -> str:
+            if self._arbiter.last_arm_command is not True:
+                return SUPERSEDED
+            return "" if self._session.watch.reboots == reboots else REBOOTED
+
+        await await_progress(
+            self._session,
+            "arm()",
+            is_done=is_done,
+            failure_reason=failure_reason,
+            describe=lambda: f"the vehicle reported armed; nothing was sent; {self._session.describe_link()}",
+            timeout=timeout,
+            max_silence_s=max_silence_s,
+        )
+        if not armed.latest and not replaces_disarm:  # A pilot may have disarmed it.
+            raise OperationRejected("arm(): the vehicle was armed and has just disarmed; nothing was sent: call again")
+        return bool(armed.latest)
+
+    def _mode_instead_of_flight(self) -> Mode | None:
+        """Return the mode to arm in if the present one would start a flight that the program has not ordered."""
+        would_start_flight = self._is_in_unordered_flight_mode() and not self.telemetry.is_armed
+        return self.autopilot.mode_to_arm_in() if would_start_flight else None
+
     def _mode_to_arm_in(self, mode: str | int | None) -> Mode | None:
         """Return the mode to change to before arming; None to arm in the present mode."""
         if mode is not None:
@@ -314,6 +378,8 @@ class ArmingActions(VehicleBase):
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return arming_mode
+        if (safe_mode := self._mode_instead_of_flight()) is not None:
+            return safe_mode
         # A booting vehicle still sets its mode by itself, and may undo a mode change of this program.
         is_booting = self.telemetry.system_status.latest in BOOT_STATES
         must_keep_mode = self._flight_cleanup.is_stream_open or is_booting

@@ -12,9 +12,16 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.connection.tasks import Cancellation
-from aerokit.errors import AerokitError, BusyError, HeartbeatTimeout, OperationRejected, OperationTimeout
+from aerokit.errors import (
+    AerokitError,
+    BusyError,
+    CommandRejected,
+    HeartbeatTimeout,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags
-from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, was_armed_by_order
+from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, STEERING, was_armed_by_order
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -291,10 +298,19 @@ ARM_CLOSE_TIMEOUT_S = 1.5
 
 
 class ArmCleanup:
-    """Monitors the vehicle after an arm order was abandoned, and disarms it if this order arms it after all."""
+    """Monitors the vehicle after an arm order was abandoned, and disarms it if this order arms it after all.
 
-    def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
-        self._session, self._arbiter, self._sender = session, arbiter, sender
+    ``hold`` orders the vehicle to hold, for a vehicle that has begun a flight and does not disarm in the air.
+    """
+
+    def __init__(
+        self,
+        session: VehicleSession,
+        arbiter: CommandArbiter,
+        sender: OrderSender,
+        hold: Callable[[], Awaitable[None]],
+    ) -> None:
+        self._session, self._arbiter, self._sender, self._hold = session, arbiter, sender, hold
         self._task = BackgroundTask(
             session, "aerokit late arming", warning_clause="while an arm command may still be executed"
         )
@@ -366,11 +382,35 @@ class ArmCleanup:
             return
         logger.warning("an abandoned arm command has armed the vehicle: aerokit disarms it again")
         with anyio.CancelScope(shield=True):
-            try:
-                with self._arbiter.auxiliary_order(ends_flight=True) as disarm_order:
+            with self._arbiter.auxiliary_order(ends_flight=True) as disarm_order:
+                try:
                     await self._sender.send_disarm(disarm_order)
-            except AerokitError as error:
-                logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
+                except AerokitError as error:
+                    logger.error(
+                        "an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error
+                    )
+                    was_refused = isinstance(error, CommandRejected) and self._is_newest_arm_command(disarm_order)
+                    if was_refused and self._has_begun_flight(order):
+                        await self._hold_after_arming()
+
+    def _has_begun_flight(self, order: Order) -> bool:
+        """Return True if the vehicle was armed in a mode that starts a flight, and no newer order steers it."""
+        telemetry, newest = self._session.telemetry, self._arbiter.latest(STEERING)
+        was_steered = newest is not None and newest.number > order.number
+        return (
+            telemetry.mode_name in self._session.autopilot.modes_starting_flight
+            and telemetry.is_armed
+            and not was_steered
+            and self._arbiter.is_state_recent
+        )
+
+    async def _hold_after_arming(self) -> None:
+        mode = self._session.telemetry.mode_name
+        logger.warning("the vehicle was armed in %s, which your program has not ordered, and flies: it must hold", mode)
+        try:
+            await self._hold()
+        except AerokitError as error:
+            logger.error("the vehicle that was armed in %s does not hold: %s", mode, error)
 
     async def _was_armed_by(self, order: Order, mode_when_abandoned: Mode | None) -> bool:
         """Return True if this order, and no other party, has armed the vehicle."""

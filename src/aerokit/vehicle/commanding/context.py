@@ -43,7 +43,7 @@ class VehicleContext:
         )
         self.sender: OrderSender = OrderSender(session, self.arbiter)
         self.flight_cleanup: FlightCleanup = FlightCleanup(session, self.arbiter, self.sender)
-        self.arm_cleanup: ArmCleanup = ArmCleanup(session, self.arbiter, self.sender)
+        self.arm_cleanup: ArmCleanup = ArmCleanup(session, self.arbiter, self.sender, self.flight_cleanup.hold)
         self.health: Health = Health(session)
         self.vehicle_position: VehiclePosition = VehiclePosition(session)
         self.finish_callbacks: list[Callable[[], None]] = []
