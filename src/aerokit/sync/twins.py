@@ -1636,7 +1636,6 @@ class Logs(TwinOf["AsyncLogs"]):
 
         Raises:
             FileTimeout: some of the old logs still exist.
-            OperationRejected: the link was lost meanwhile, and the reopened link may lead to another vehicle.
         """
         self._loop.run(self.aio.erase, idle_timeout_s=idle_timeout_s, timeout=timeout)
 

@@ -212,7 +212,6 @@ class Logs:
 
         Raises:
             FileTimeout: some of the old logs still exist.
-            OperationRejected: the link was lost meanwhile, and the reopened link may lead to another vehicle.
         """
         async with self._channel.operation("erase logs", timeout):
             watch = self._context.session.watch
