@@ -58,7 +58,7 @@ USED_BY_THE_LIBRARY = {
         "last_heartbeat_at",
         "send_as",
     }
-    | {"on_end", "record", "observe_frames", "observe_sent_frames", "order_refused"}
+    | {"on_end", "record", "observe_frames", "observe_sent_frames", "order_refused", "hold_back", "is_held_back"}
     | {"member_link_changed", "member_link_open_failed", "member_link_stalled"},
 }
 """Only called by the library itself."""
