@@ -343,7 +343,7 @@ async def test_restored_link_to_other_vehicle_gets_no_signing_key() -> None:
 async def test_restored_link_to_other_vehicle_gets_no_rest_of_order() -> None:
     async with cabled_beside_other() as (_, vehicle, _, exchange):
         await exchange()
-        with pytest.raises(OperationRejected, match="nothing was sent to it"):
+        with pytest.raises(OperationRejected, match="nothing was sent over this link"):
             await vehicle._session.wait_for_heartbeat()
 
 
@@ -390,7 +390,7 @@ async def test_transfer_does_not_mix_vehicles_of_restored_link(transfer: str) ->
 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(exchange_soon)
-            with pytest.raises(OperationRejected, match="transfer has ended: the reopened link"):
+            with pytest.raises(OperationRejected, match="transfer has ended: the vehicle's clock"):
                 await calls[transfer]()
         assert not received
 

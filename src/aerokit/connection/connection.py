@@ -319,9 +319,9 @@ class Connection:
         """Call ``callback(frame, peer)`` with every received frame, after the subscribers got the message.
 
         Frames with message ids outside the dialect are included, and their checksums are not checked. Frames of a
-        second peer under the ids of a known component are refused, and not included, and so are those of a vehicle
-        after a lost link until its time since boot shows that it is the same. The callback must return quickly;
-        its exceptions are logged. Observers cost time, because every frame must then become an object.
+        second peer under the ids of a known component are refused, and not included. On a reopened link, frames of a
+        vehicle are included once its time since boot shows whether it is the same vehicle. The callback must return
+        quickly; its exceptions are logged. Observers cost time, because every frame must then become an object.
         """
         return self._observers.add(callback)
 

@@ -62,12 +62,12 @@ class OtherPeer:
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
-            # Only the first frame's sequence number counts, because a peer could try until a number matches.
+            # Only the first frame's sequence number counts, so that a peer cannot try until a number matches.
             self._sequence_matches = sequence_matches
             self._clock_matches = None
             self._began_at = frame.received_at
         self._frames += 1
-        # A mismatch of the clock is final, because another sender could try until a frame matches by chance.
+        # A mismatch of the clock is final, so that another sender cannot try until a frame matches by chance.
         if clock_matches is not None and self._clock_matches is not False:
             self._clock_matches = clock_matches
 

@@ -25,7 +25,7 @@ REPEAT_WINDOW_S = 0.5
 """Seconds in which an equal frame from the same port counts as a duplicate, if its number is out of order."""
 
 NEW_PORT_WINDOW_S = 0.1
-"""Like `DUPLICATE_WINDOW_S`, for a port that is newer than the earlier frame. A restarted program needs longer."""
+"""Like `DUPLICATE_WINDOW_S`, for a port added after the earlier frame arrived. A program takes longer to restart."""
 
 LOOP_WINDOW_S = 60.0
 """A frame that returns through another port is recognised up to this time after it was first received.
@@ -87,12 +87,12 @@ class Sender:
 
     @property
     def may_become_vehicle(self) -> bool:
-        """True before the first HEARTBEAT of a sender that is too new to be known as one without HEARTBEATs."""
+        """True until the first HEARTBEAT of a sender, for `ROUTE_TIMEOUT_S` seconds at most."""
         return not self.has_heartbeat and self.received_at - self.first_received_at <= ROUTE_TIMEOUT_S
 
     @property
     def has_one_destination(self) -> bool:
-        """True for vehicles, which would execute a command twice if it was sent to all `ports`."""
+        """True for a possible vehicle, which would execute a command twice if it was sent to all `ports`."""
         return self.is_vehicle or self.may_become_vehicle
 
     @property

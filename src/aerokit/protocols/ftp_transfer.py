@@ -368,10 +368,10 @@ class FtpDownload(FtpExchange[int]):
 class FtpUpload(FtpExchange[None]):
     """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged.
 
-    With ``first_block_last``, the first block is sent when all others are acknowledged. ArduPilot evaluates a virtual
-    file, whose name begins with ``@``, when it is closed, also after an interrupted upload. Only without the magic
-    number in the first block does it ignore an incomplete file: of ``@PARAM/param.pck`` it sets all parameters that
-    have arrived, one of them to 0 or to a part of its value (AP_Filesystem_Param.cpp, param_upload_parse).
+    With ``first_block_last``, the first block is sent when all others are acknowledged. When a virtual file, whose
+    name begins with ``@``, is closed, ArduPilot evaluates it even if the upload was interrupted. Of an incomplete
+    ``@PARAM/param.pck``, it sets all parameters that have arrived, one of them to 0 or to a part of its value
+    (AP_Filesystem_Param.cpp, param_upload_parse). It ignores a file without the magic number in the first block.
     """
 
     def __init__(

@@ -164,8 +164,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # It may answer a late copy of an item that an earlier upload has sent. So it counts only if the request is
-            # not answered in time.
+            # ERROR may answer a late copy of an item that an earlier upload has sent, so it counts only if the request
+            # is not answered in time.
             self._has_error = True
         elif result not in (
             MavMissionResult.ACCEPTED,

@@ -200,7 +200,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_request_after_end(self, now: float) -> None:
         # While PX4 waits for the first item of an upload, it does not accept the number of items of another one
-        # (mavlink_mission.cpp, handle_mission_count). It waits so if the cancellation of an earlier upload was lost.
+        # (mavlink_mission.cpp, handle_mission_count). This happens if the cancellation of an earlier upload was lost.
         may_restart = not self.is_partial and self._restarts < MAX_RESTARTS
         if self._vehicle_has_requested and self._sent_end == self._end and may_restart:
             self._restarts += 1
@@ -255,8 +255,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._succeed(now, is_confirmed=is_confirmed, opaque_id=opaque_id)
 
     def _is_answer_to_copy(self, result: int, now: float) -> bool:
-        """Return True if ArduPilot has received MISSION_WRITE_PARTIAL_LIST again. It then goes on with the transfer."""
-        # ArduPilot then answers DENIED (MissionItemProtocol.cpp, handle_mission_write_partial_list). After
+        """Return True if ArduPilot has received MISSION_WRITE_PARTIAL_LIST twice. It continues the transfer."""
+        # ArduPilot answers the second one by DENIED (MissionItemProtocol.cpp, handle_mission_write_partial_list). After
         # TRANSFER_EXPIRY_S, DENIED may instead be about another station's transfer.
         is_recent = now - self._progress_at < TRANSFER_EXPIRY_S
         return result == MavMissionResult.DENIED and self.is_partial and self._vehicle_has_requested and is_recent

@@ -18,8 +18,8 @@ DEFAULT_SIZE = 20
 MAX_GROWTH = 5
 # An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
-# From attempt DUPLICATE_FROM_ATTEMPT on, each of the last FEW_LEFT requests is sent as two copies. Over a bad radio, a
-# transfer would wait long for their answers.
+# From attempt DUPLICATE_FROM_ATTEMPT on, each of the last FEW_LEFT requests is sent as two copies: over a bad radio, a
+# transfer would otherwise wait long for their answers.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
 # Maximum time-out of the last few requests, unless two round trips are longer. Repeating them costs little.
 FEW_LEFT_TIMEOUT_S = 0.5

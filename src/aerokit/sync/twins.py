@@ -4379,7 +4379,7 @@ class Vehicle(VehicleTwin):
         a mission, it changes back to MISSION by itself. Without ``mode``, aerokit therefore changes to LOITER first,
         unless your program has ordered MISSION or TAKEOFF since the vehicle disarmed. If PX4 reports armed already,
         aerokit sends no command and waits for the next HEARTBEAT, because PX4 may disarm and change the mode meanwhile.
-        The same applies to ArduPlane in TAKEOFF, which it leaves for FBWA.
+        aerokit treats ArduPlane in the same way: it changes TAKEOFF to FBWA.
         If another party changes to such a mode right before the command arrives, the call raises OperationRejected;
         aerokit then disarms the vehicle, or orders it to hold if it is flying.
 

@@ -256,7 +256,7 @@ async def test_refused_repetition_of_executed_order_is_no_refusal() -> None:
 
 
 async def test_order_without_effect_is_not_sent_again_after_reboot() -> None:
-    """Rule 3 of docs/reliability.md; after a lost link, the camera may even be another vehicle's."""
+    """The order ends by rule 3 of docs/reliability.md. After a lost link, the camera may be another vehicle's."""
     async with on_board(SimulatedCamera()) as vehicle:
         await vehicle.camera.wait_found()
         link = vehicle.camera._link

@@ -246,7 +246,7 @@ async def test_copy_of_ack_does_not_acknowledge_next_command(grounded: Flight) -
 
 
 async def test_equal_acks_of_component_with_constant_sequence_count(grounded: Flight) -> None:
-    """Its answers to two commands that are never repeated are as equal as copies, but its HEARTBEAT shows why."""
+    """Its acks of two commands are equal. They are no copies, because its HEARTBEAT has the same sequence number."""
 
     def send(message: Message) -> None:
         grounded.wire.deliver(FrameEncoder(1, 100).encode(message))

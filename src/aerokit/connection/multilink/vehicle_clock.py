@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MAX_SAMPLES = 20
 MIN_TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
-MAX_DRIFT_S = 0.5  # Limits the tolerance, which grows during a silence: in the end, any clock would match.
+MAX_DRIFT_S = 0.5  # Limits the tolerance, which grows during a silence, so that not every clock matches in the end.
 # A measured clock rate of 1 ± this value counts as 1. During a long silence, a small error of the measured rate would
 # add up to a large error of the clock.
 REAL_TIME_TOLERANCE = 0.05

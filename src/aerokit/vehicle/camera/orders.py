@@ -119,7 +119,7 @@ class CameraOrders:
 
     @property
     def other_boots(self) -> int:
-        """Number of these after which the reopened link may lead to another vehicle."""
+        """Number of `reboots` that were detected on a reopened link, which may lead to another vehicle."""
         return self._session.watch.other_boots
 
     def begin_order(self, subject: str) -> Order:

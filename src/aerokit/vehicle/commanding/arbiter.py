@@ -59,7 +59,7 @@ class CommandArbiter:
         is_held_back: Callable[[], bool] = lambda: False,
     ) -> None:
         self._now, self._telemetry = now, telemetry
-        # Returns True while the link was lost, until the vehicle has proved that it is the same boot.
+        # Returns True from a loss of the link until the vehicle's clock shows whether it is the same boot.
         self._is_held_back = is_held_back
         # Returns how many seconds the computer has slept since the given time.
         self.slept_since = slept_since

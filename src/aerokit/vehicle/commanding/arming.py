@@ -138,7 +138,7 @@ class ArmingActions(VehicleBase):
         a mission, it changes back to MISSION by itself. Without ``mode``, aerokit therefore changes to LOITER first,
         unless your program has ordered MISSION or TAKEOFF since the vehicle disarmed. If PX4 reports armed already,
         aerokit sends no command and waits for the next HEARTBEAT, because PX4 may disarm and change the mode meanwhile.
-        The same applies to ArduPlane in TAKEOFF, which it leaves for FBWA.
+        aerokit treats ArduPlane in the same way: it changes TAKEOFF to FBWA.
         If another party changes to such a mode right before the command arrives, the call raises OperationRejected;
         aerokit then disarms the vehicle, or orders it to hold if it is flying.
 
@@ -326,7 +326,7 @@ class ArmingActions(VehicleBase):
     # ------------------------------------------------------------------------ modes for arming
 
     async def _is_armed_already(self, timeout: float, max_silence_s: float | None) -> bool:
-        """Return True if the vehicle is armed, and needs no command. Waits for a HEARTBEAT if the last one says so.
+        """Return True if the vehicle needs no arm command. If it reports armed, wait for the next HEARTBEAT first.
 
         A vehicle that disarms before a command arrives might change to a mode in which the command starts a flight.
         For firmware without such modes, returns False at once.
@@ -335,7 +335,7 @@ class ArmingActions(VehicleBase):
             return False
         armed, started, reboots = self.telemetry.armed, self.connection.now(), self._session.watch.reboots
         replaces_disarm = self._arbiter.last_arm_command is False
-        # Until then, HEARTBEAT may not yet report the effect of an earlier command to disarm.
+        # Until this time, HEARTBEAT may not yet report the effect of an earlier command to disarm.
         is_certain_at = max(started, self._arbiter.last_disarm_command_at + ARM_HEARTBEAT_DELAY_S)
         self._arm_cleanup.stop_watching()
         self._arbiter.supersede_arm_commands(True)

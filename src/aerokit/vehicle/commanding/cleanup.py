@@ -300,7 +300,7 @@ ARM_CLOSE_TIMEOUT_S = 1.5
 class ArmCleanup:
     """Monitors the vehicle after an arm order was abandoned, and disarms it if this order arms it after all.
 
-    ``hold`` orders the vehicle to hold, for a vehicle that has begun a flight and does not disarm in the air.
+    ``hold`` is called if the vehicle has begun a flight and therefore refuses to disarm.
     """
 
     def __init__(
@@ -406,7 +406,7 @@ class ArmCleanup:
 
     async def _hold_after_arming(self) -> None:
         mode = self._session.telemetry.mode_name
-        logger.warning("the vehicle was armed in %s, which your program has not ordered, and flies: it must hold", mode)
+        logger.warning("the vehicle was armed in %s, which was not ordered, and flies: aerokit orders a hold", mode)
         try:
             await self._hold()
         except AerokitError as error:

@@ -219,7 +219,7 @@ class Logs:
 
             def raise_if_other_boot() -> None:
                 if watch.other_boots != other_boots:
-                    raise OperationRejected(f"erase logs: {OTHER_BOOT}; the first may have erased its logs")
+                    raise OperationRejected(f"erase logs: {OTHER_BOOT}; the previous vehicle may have erased its logs")
 
             remaining = await self._entries(IDLE_TIMEOUT_S)
             raise_if_other_boot()

@@ -134,7 +134,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         return self._context.caches[self._get_plan_type().MISSION_TYPE].items
 
     def _may_differ_from(self, uploaded_items: Sequence[MissionItem] | None) -> bool:
-        """Return True if the vehicle may have other items now than ``uploaded_items``, its `_known_items` of before."""
+        """Return True if the vehicle may have other items now than ``uploaded_items``, an earlier `_known_items`."""
         return self._context.may_differ(self._get_plan_type().MISSION_TYPE, uploaded_items)
 
     def _get_plan_type(self) -> type[PlanT]:

@@ -184,8 +184,8 @@ class PlanChannel:
         finally:
             # If this call was cancelled, the transfer is also cancelled on the vehicle. A reopened link may lead to
             # another vehicle, which may have a transfer with another station.
-            is_proved = session.watch.other_boots == other_boots and not connection.is_held_back(session.system_id)
-            if not exchange.done and connection.is_open and is_proved:
+            is_same_boot = session.watch.other_boots == other_boots and not connection.is_held_back(session.system_id)
+            if not exchange.done and connection.is_open and is_same_boot:
                 for cancellation in exchange.cancellation():
                     connection.send(cancellation)
 
@@ -316,7 +316,7 @@ class PlanTransfer(Generic[PlanT]):
         """Return True if the vehicle has just erased a fence of one or two circles.
 
         Its FENCE_TOTAL is 0. If that was not 0 before, ArduPilot takes the change for an order to erase the fence
-        (AC_PolyFence_loader.cpp, write_fence and update). The same fence then remains after its next upload.
+        (AC_PolyFence_loader.cpp, write_fence and update). A second upload of the same fence is not erased.
         """
         zone_points = sum(item.command != MavCmd.NAV_FENCE_RETURN_POINT for item in items)
         is_small_fence = self._mission_type == MavMissionType.FENCE and zone_points < MIN_KEPT_ZONE_POINTS
@@ -432,8 +432,8 @@ class PlanTransfer(Generic[PlanT]):
             if result.is_confirmed:
                 raise
             if may_repeat:
-                # The answers were ambiguous. PX4 answers so if it has taken the first of our items for those of an
-                # earlier, shorter upload, whose cancellation was lost. That upload has ended now.
+                # The answers were ambiguous. PX4 may have taken the first of our items for those of an earlier, shorter
+                # upload, whose cancellation was lost. That upload has ended now.
                 await self._send_items(items, method, verify=verify, may_repeat=False)
                 return
             # The differences show that the vehicle refused the plan.

@@ -316,7 +316,7 @@ class Transaction(_Block):
 
 
 def abandon(block: TemporaryParameters | Transaction, error: AerokitError, cause: BaseException | None) -> None:
-    """End a block whose connection has ended with its loop (``error``), and raise what its end would raise.
+    """End a block whose connection has ended with its loop (``error``), and raise what leaving it would raise.
 
     ``cause`` is the exception that has left the block, or None.
     """

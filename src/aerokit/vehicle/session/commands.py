@@ -33,7 +33,7 @@ PENDING_ACK_TIMEOUT_S = 2.0
 # repeat after 256 frames, so that a new ack is equal by chance only if the vehicle sends more than 256 frames a second.
 COPY_WINDOW_S = 1.0
 MAX_RECENT_ACKS = 16
-# A HEARTBEAT of the last seconds has another sequence number than an ack, unless the sender does not count its frames.
+# A HEARTBEAT of the last seconds has another sequence number than an ack, unless the sender's number is constant.
 HEARTBEAT_WINDOW_S = 2.0
 
 _Key = tuple[int, int]
@@ -337,7 +337,7 @@ class CommandSender:
         return False
 
     def _has_constant_sequence(self, ack: Frame) -> bool:
-        """Return True if the sender does not count its frames, so that its equal acks need not be copies."""
+        """Return True if the sender's sequence number is constant, so that its equal acks need not be copies."""
         heartbeat = self._connection.heartbeats.get((ack.system_id, ack.component_id))
         frame = None if heartbeat is None else heartbeat.received_frame
         is_recent = frame is not None and ack.received_at - frame.received_at <= HEARTBEAT_WINDOW_S

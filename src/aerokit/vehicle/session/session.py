@@ -271,7 +271,7 @@ class VehicleSession:
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
         """Wait for a HEARTBEAT received after ``since``, by default after this call.
 
-        Raises OperationRejected if a link was reopened meanwhile that may lead to another vehicle.
+        Raises OperationRejected if the link was reopened meanwhile and may lead to another vehicle.
         """
         other_boots = self.watch.other_boots
         # Every HEARTBEAT updates `armed`.
@@ -282,7 +282,7 @@ class VehicleSession:
             lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
         )
         if self.watch.other_boots != other_boots:
-            raise OperationRejected(f"{OTHER_BOOT}; nothing was sent to it")
+            raise OperationRejected(f"{OTHER_BOOT}; nothing was sent over this link")
 
     def is_answer(self, ack: CommandAck, command: int) -> bool:
         frame = ack.received_frame
@@ -422,7 +422,7 @@ class VehicleSession:
 
     def _on_link_restored(self, event: LinkRestored) -> None:
         self.rates.request_again()
-        # The answers show whether it is the same boot of the same vehicle.
+        # The answers show whether the link leads to the same boot of the same vehicle.
         self.link_watch.request_time()
 
     def _on_computer_slept(self, event: ComputerSlept) -> None:

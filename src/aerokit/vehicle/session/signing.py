@@ -35,7 +35,7 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
         with anyio.move_on_after(timeout):
             while not has_accepted.is_set():
                 if session.watch.other_boots != other_boots:
-                    raise OperationRejected(f"setup_signing: {OTHER_BOOT}; the first may have taken the key")
+                    raise OperationRejected(f"setup_signing: {OTHER_BOOT}; the previous vehicle may have taken the key")
                 if not connection.is_held_back(session.system_id):
                     session.send(_message(session, signing))
                 with anyio.move_on_after(RETRY_INTERVAL_S):

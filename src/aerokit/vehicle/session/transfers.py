@@ -115,12 +115,12 @@ class Transfers:
         """Run one exchange to its end and return its result.
 
         Cancellation ends the exchange at once. Raises :class:`OperationTimeout` after ``timeout`` seconds, or when the
-        exchange itself times out, and :class:`OperationRejected` if it spans a lost link after which the vehicle is not
-        in the same boot.
+        exchange itself times out, and :class:`OperationRejected` if the link was reopened meanwhile and may lead to
+        another vehicle.
         """
         self._end.raise_if_ended()
         connection, has_changed_boot = self.connection, False
-        was_held_back = connection.is_held_back(self.system_id)  # Nothing was exchanged then.
+        was_held_back = connection.is_held_back(self.system_id)  # If True, the exchange begins after the proof.
 
         def on_reboot(event: VehicleRebooted) -> None:
             nonlocal has_changed_boot
@@ -149,7 +149,7 @@ class Transfers:
                         self._append_link_description(answer)
             return result
         self._end.raise_if_ended()
-        assert has_changed_boot  # Only this and the end of the session cancel `scope`.
+        assert has_changed_boot  # Only `on_reboot` and the end of the session cancel `scope`.
         raise OperationRejected(f"the transfer has ended: {OTHER_BOOT}")
 
     def _append_link_description(self, error: OperationTimeout) -> None:

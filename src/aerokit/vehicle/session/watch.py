@@ -41,13 +41,13 @@ REBOOT_CONFIRM_S = 0.2
 # a boot takes longer. A late message is behind as well, so the time must also be less than the time since the order.
 EXPECTED_REBOOT_MIN_LAG_MS = 2000
 # When a lost link is back, the time since boot must have continued, with a tolerance of these seconds plus this
-# fraction of the interruption. A larger difference shows a reboot or another vehicle. It must persist for
-# RESUME_CONFIRM_S, because the first messages may be late.
+# fraction of the interruption. A larger difference shows a reboot or another vehicle if it persists for
+# RESUME_CONFIRM_S. The first messages may be late.
 RESUME_TOLERANCE_S, RESUME_TOLERANCE_RATIO = 1.5, 0.05
 RESUME_CONFIRM_S = 1.0
-# If the vehicle sends no time since boot for this many seconds after its first message, it counts as rebooted. The same
-# if delayed messages seem to arrive for MAX_PROOF_S.
-RESUME_TIMEOUT_S, MAX_PROOF_S = 5.0, 30.0
+# If the vehicle sends no time since boot for this many seconds after its first message, it counts as rebooted. It
+# also does so if delayed messages seem to arrive for MAX_HOLD_BACK_S.
+RESUME_TIMEOUT_S, MAX_HOLD_BACK_S = 5.0, 30.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
 # many seconds apart.
 CLOCK_SPAN_S = 5.0
@@ -62,8 +62,8 @@ TIMESYNC_PERIOD_S = 2.0
 # A round trip is unknown again after this many seconds without an answer to TIMESYNC. The link may have changed.
 ROUND_TRIP_MAX_AGE_S = 10.0
 BOOT_CLOCK, BOOT_CLOCK_RANGE_MS = "time_boot_ms", 1 << 32
-OTHER_BOOT = "the reopened link does not lead to the same boot of the same vehicle, as far as its clock shows"
-"""Error text about a vehicle that has not proved, after the link was reopened, to be in the same boot."""
+OTHER_BOOT = "the vehicle's clock does not show that the reopened link leads to the same boot of the same vehicle"
+"""Reason for the end of orders and transfers on a reopened link that may lead to another vehicle."""
 # Maximum number of unanswered TIMESYNC requests; older ones are considered lost.
 MAX_OPEN_REQUESTS = 64
 
@@ -128,7 +128,7 @@ class VehicleWatch:
         self.reboots: int = 0
         """Number of reboots detected."""
         self.other_boots: int = 0
-        """Number of these after which the reopened link may lead to another vehicle."""
+        """Number of `reboots` that were detected on a reopened link, which may lead to another vehicle."""
         self._last_readings: dict[str, _ClockReading] = {}
         # The first reading of each clock since the start of the session or a reboot.
         self._first_readings: dict[str, _ClockReading] = {}
@@ -136,15 +136,15 @@ class VehicleWatch:
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
         # The lowest reading of each decreased clock, until `_is_decrease_confirmed` decides if it shows a reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
-        # Ends the time from the loss of the link until the vehicle's clock has proved that it is the same boot of the
-        # same vehicle. None if there is no such time.
+        # Makes the connection deliver the vehicle's frames again. It holds them back from a loss of the link until the
+        # vehicle's clock shows whether it is the same boot of the same vehicle. None if they are not held back.
         self._deliver_again: Detach | None = None
         # The clocks when the link was lost, as far as their speed was known.
         self._lost_clocks: dict[str, _LostClock] = {}
-        # The first reading of each clock since then that does not continue the clock.
+        # The first reading of each clock since the loss that does not continue the clock.
         self._resumed_readings: dict[str, _ClockReading] = {}
-        # Times of the first frame since then, and of the last of these readings or, without one, of that frame.
-        self._unproved_since: float | None = None
+        # Time of the first frame since the loss, and of the last reading since that frame.
+        self._first_held_back_at: float | None = None
         self._clock_read_at = -math.inf
         # Time of an order to reboot that is in progress; None if there is none.
         self._reboot_ordered_at: float | None = None
@@ -184,7 +184,7 @@ class VehicleWatch:
 
     def close(self) -> None:
         self._connection.boot_clocks.pop((self._system_id, self._component_id), None)
-        self._end_proof()
+        self._end_hold_back()
         for detach in self._detach_callbacks:
             detach()
 
@@ -234,9 +234,9 @@ class VehicleWatch:
         now = self._connection.now()
         silent_for = self.silent_for_s
         self._state_tracker.check(now)
-        if self._unproved_since is not None:
+        if self._first_held_back_at is not None:
             has_clock_stopped = now - self._clock_read_at > RESUME_TIMEOUT_S
-            if has_clock_stopped or now - self._unproved_since > MAX_PROOF_S:
+            if has_clock_stopped or now - self._first_held_back_at > MAX_HOLD_BACK_S:
                 self._on_reboot_detected({})
         if silent_for > SILENT_AFTER_S and not self._is_reported_silent:
             self._is_reported_silent = True
@@ -257,11 +257,11 @@ class VehicleWatch:
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
         self._state_tracker.mark_lost(event.at)
-        self._resumed_readings, self._unproved_since = {}, None
+        self._resumed_readings, self._first_held_back_at = {}, None
         if self._deliver_again is not None:  # The link was lost again before the clocks were compared.
             return
         self._lost_clocks = self._comparable_clocks()
-        self._deliver_again = self._connection.hold_back(self._system_id, self._on_unproved_frame)
+        self._deliver_again = self._connection.hold_back(self._system_id, self._on_held_back_frame)
 
     def _comparable_clocks(self) -> dict[str, _LostClock]:
         """Return the clocks that must continue after the loss of the link; none if their speed is unknown."""
@@ -280,19 +280,19 @@ class VehicleWatch:
             lost_clocks[clock] = _LostClock(last, speed, tolerance_ratio, is_speed_known=span_s >= MIN_CLOCK_SPAN_S)
         return lost_clocks
 
-    def _on_unproved_frame(self, frame: Frame) -> None:
-        """Compare the clock in a frame that arrived after the link was lost with the clock from before."""
-        if not self._lost_clocks:  # Nothing can show whether it is the same boot of the same vehicle.
+    def _on_held_back_frame(self, frame: Frame) -> None:
+        """Compare the clock in a frame that arrived after a loss of the link with the clock before the loss."""
+        if not self._lost_clocks:  # There is no clock to compare with.
             self._on_reboot_detected({})
             return
-        if self._unproved_since is None:
-            self._unproved_since = self._clock_read_at = self._now()
+        if self._first_held_back_at is None:
+            self._first_held_back_at = self._clock_read_at = self._now()
         handler = self._clock_handlers.get(frame.message_id)
         if handler is not None:
             handler(frame)
 
-    def _end_proof(self) -> None:
-        self._lost_clocks, self._unproved_since = {}, None
+    def _end_hold_back(self) -> None:
+        self._lost_clocks, self._first_held_back_at = {}, None
         if self._deliver_again is not None:
             self._deliver_again()
             self._deliver_again = None
@@ -345,13 +345,13 @@ class VehicleWatch:
         return unwrapped if abs(unwrapped - expected) <= REBOOT_MIN_DECREASE_MS else milliseconds
 
     def _is_other_boot(self, clock: str, reading: _ClockReading) -> bool:
-        """Return True if the clock does not continue that from before the last loss of the link."""
+        """Return True if this reading confirms another boot. If it proves the same one, deliver frames again."""
         last, speed, tolerance_ratio, is_speed_known = self._lost_clocks[clock]
         away_s = reading.read_at - last.read_at + self._connection._slept_since(last.read_at)
         difference_ms = abs(reading.milliseconds - last.milliseconds - speed * away_s)
         tolerance_s = RESUME_TOLERANCE_S + last.waited_s + reading.waited_s + tolerance_ratio * away_s
         if difference_ms <= speed * tolerance_s:
-            self._end_proof()
+            self._end_hold_back()
             return False
         if not is_speed_known:
             return True
@@ -394,7 +394,7 @@ class VehicleWatch:
         self.other_boots += self._deliver_again is not None
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
-        self._end_proof()  # The subscribers above can still see that the link was lost.
+        self._end_hold_back()  # The subscribers above can still see that the link was lost.
 
 
 class _Counts(NamedTuple):
