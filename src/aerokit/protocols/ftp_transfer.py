@@ -435,7 +435,7 @@ class FtpUpload(FtpExchange[None]):
         if not self._unwritten:
             self._finish(None)
             return
-        if self._is_first_block_held and list(self._unwritten) == [0]:
+        if self._is_first_block_held and len(self._unwritten) == 1:
             self._is_first_block_held = False
             self._requests.request(0)
         for offset in self._requests.take_due(now):

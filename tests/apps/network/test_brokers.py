@@ -161,7 +161,7 @@ async def test_mqtt_silent_server_times_out(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 async def test_mqtt_cancellation_at_time_out_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    # A scope of anyio before 4.16 loses a cancellation in the iteration of the loop in which its deadline passes.
+    # On Python 3.10 a scope of anyio loses a cancellation in the iteration of the loop in which its deadline passes.
     monkeypatch.setattr(sys.modules["aerokit.apps.network.mqtt_publisher"], "CONNECT_TIMEOUT_S", 0.2)
     writers: list[asyncio.StreamWriter] = []
     async with await asyncio.start_server(lambda _r, w: writers.append(w), "127.0.0.1", 0) as silent:

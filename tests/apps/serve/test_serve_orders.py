@@ -227,7 +227,7 @@ async def test_keys_are_bounded_and_single_use(
 
 @pytest.mark.parametrize("offset_s", [-1e-10, 1e-10])
 async def test_cancelled_request_does_not_answer(offset_s: float) -> None:
-    # A scope of anyio before 4.16 loses a cancellation in the iteration of the loop in which its deadline passes.
+    # On Python 3.10 a scope of anyio loses a cancellation in the iteration of the loop in which its deadline passes.
     async with open_stage() as stage:
         await stage.submit("arm")
         loop = asyncio.get_running_loop()

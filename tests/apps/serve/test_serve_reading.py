@@ -314,7 +314,7 @@ async def test_failed_stream_is_logged_and_closed(
 
 @pytest.mark.parametrize("offset_s", [-1e-10, 1e-10])
 async def test_cancellation_as_next_state_is_due_ends_stream(offset_s: float) -> None:
-    # A scope of anyio before 4.16 loses a cancellation in the iteration of the loop in which its deadline passes.
+    # On Python 3.10 a scope of anyio loses a cancellation in the iteration of the loop in which its deadline passes.
     async with open_stage() as stage:
         loop, period_s = asyncio.get_running_loop(), 1.0
         access = AccessControl(TOKEN, open_reading=False, read_only=False)

@@ -167,7 +167,7 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
-        # Not `asyncio.wait_for` or `move_on_after`: before Python 3.12 and anyio 4.16, they could lose a cancellation.
+        # Not `wait_for` or `move_on_after`: on Python 3.10 they can lose a cancellation at the time-out.
         await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
         refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it an MQTT broker?)"
         if self._connect_result.done():

@@ -507,7 +507,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
 
 
 async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
-    # Not `asyncio.wait_for` or `move_on_after`: before Python 3.12 and anyio 4.16, they could lose a cancellation.
+    # Not `wait_for` or `move_on_after`: on Python 3.10 they can lose a cancellation at the time-out.
     waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)

@@ -138,7 +138,7 @@ class StateStream:
                         missed = 0
                     await _send(socket, json.dumps(message, ensure_ascii=False))
                 changed.clear()
-                # Not `move_on_after`: anyio before 4.16 could lose a cancellation at the deadline.
+                # Not `move_on_after`: on Python 3.10 it can lose a cancellation at the deadline.
                 timer = loop.call_later(max(0.001, next_snapshot_at - loop.time()), changed.set)
                 try:
                     await changed.wait()

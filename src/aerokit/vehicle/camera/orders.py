@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order, SentCommand, Topic
     from aerokit.vehicle.components.component import Component
     from aerokit.vehicle.session.session import VehicleSession
+    from aerokit.vehicle.session.watch import VehicleWatch
 
 MessageT = TypeVar("MessageT", bound=Message)
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -113,14 +114,9 @@ class CameraOrders:
         return ("camera", self.component.component_id, self.device_id, subject)
 
     @property
-    def reboots(self) -> int:
-        """Number of reboots of the vehicle so far. After a reboot, no order is repeated."""
-        return self._session.watch.reboots
-
-    @property
-    def other_boots(self) -> int:
-        """Number of `reboots` that were detected on a reopened link, which may lead to another vehicle."""
-        return self._session.watch.other_boots
+    def watch(self) -> VehicleWatch:
+        """Counts the reboots of the vehicle. After a reboot, no order is repeated."""
+        return self._session.watch
 
     def begin_order(self, subject: str) -> Order:
         return self._context.arbiter.device_order(self._ordered_topic(subject), may_be_withdrawn=True)
@@ -191,7 +187,7 @@ class CameraOrders:
         ``check_effect`` asks the camera, and returns None if there is no answer. A newer order and a reboot of the
         vehicle end the retries.
         """
-        reboots = self.reboots
+        reboots = self.watch.reboots
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
                 await send()
@@ -205,7 +201,7 @@ class CameraOrders:
                 error.was_sent = error.was_sent or attempt > 1
                 had_effect = await check_effect() if order.is_newest else None
                 # A newer order may have been given while the camera was asked.
-                if not order.is_newest or self.reboots != reboots:
+                if not order.is_newest or self.watch.reboots != reboots:
                     reason = SUPERSEDED if not order.is_newest else REBOOTED
                     error.args = (f"{error}; not sent again: {reason}",)
                     raise
@@ -218,8 +214,7 @@ class CameraOrders:
         """Send a command once, without waiting for the acknowledgement. Return False if it was not sent."""
         session = self._session
         # A link that is reopened may lead to another vehicle.
-        is_held_back = session.connection.is_held_back(session.system_id)
-        if self._component is None or not session.is_open or is_held_back:
+        if self._component is None or not session.is_open or session.is_held_back:
             return False
         session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
         return True

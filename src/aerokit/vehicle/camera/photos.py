@@ -14,7 +14,6 @@ from aerokit.vehicle.camera.capture_log import CaptureLog, CaptureQueue
 from aerokit.vehicle.camera.link import ActiveOperation
 from aerokit.vehicle.camera.orders import MAX_ORDER_ATTEMPTS
 from aerokit.vehicle.camera.values import CameraStatus, status_of
-from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -80,7 +79,8 @@ class Shutter:
             series_before = self.link.latest_order("series")
             status_before = await self.request_status_reliably()
             old_indices = {capture.index for capture in self.log.captures()}
-            reboots, other_boots = self.link.reboots, self.link.other_boots
+            watch = self.link.watch
+            reboots, other_boots = watch.reboots, watch.other_boots
             # The error to raise at the time-out; None once the last order is acknowledged. It is set here, because the
             # time may expire while the first order waits for its acknowledgement.
             unacknowledged: CommandTimeout | None = CommandTimeout(
@@ -91,8 +91,8 @@ class Shutter:
                 attempts = 1
                 unacknowledged = await self.order_photo(status_before)
                 while True:
-                    if self.link.other_boots != other_boots:  # The next picture may be another camera's.
-                        raise OperationRejected(f"{OTHER_BOOT}; {self.link.describe()} may have taken the picture")
+                    # The next picture may be another camera's.
+                    watch.raise_if_other_boot(other_boots, f"{self.link.describe()} may have taken the picture")
                     while capture := new_captures.pop():
                         if _is_new(capture, status_before, old_indices):
                             return self._successful(capture)
@@ -112,7 +112,7 @@ class Shutter:
                     # picture was taken.
                     is_series_unchanged = self.link.latest_order("series") is series_before
                     was_lost = not is_accepted and is_series_unchanged and _has_taken_none(status_before, status)
-                    if was_lost and attempts < MAX_ORDER_ATTEMPTS and self.link.reboots == reboots:
+                    if was_lost and attempts < MAX_ORDER_ATTEMPTS and watch.reboots == reboots:
                         attempts += 1
                         unacknowledged = await self.order_photo(status_before, is_repeated=True)
             raise unacknowledged or self.link.timeout_error(

@@ -141,7 +141,7 @@ class ValueStream(Generic[ValueT]):
             return
         try:
             # The reopened link may lead to another vehicle.
-            if not self._session.connection.is_held_back(self._session.system_id):
+            if not self._session.is_held_back:
                 self._send()
         except Exception as error:
             self._stop(str(error) or repr(error))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from datetime import datetime, timedelta, timezone
+from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
@@ -12,7 +13,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.files import PartFile
 from aerokit._internal.values import Snapshot
-from aerokit.errors import FileError, FileTimeout, InvalidArgument, OperationRejected
+from aerokit.errors import FileError, FileTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import LogErase
 from aerokit.protocols.blocks import Reassembly
@@ -20,7 +21,6 @@ from aerokit.protocols.exchange import IDLE_TIMEOUT_S, OnProgress
 from aerokit.protocols.logs import LOG_BLOCK
 from aerokit.vehicle.files.channel import LogChannel
 from aerokit.vehicle.files.log_stream import LogStream
-from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
     import os
@@ -215,12 +215,12 @@ class Logs:
         """
         async with self._channel.operation("erase logs", timeout):
             watch = self._context.session.watch
-            other_boots = watch.other_boots
-
-            def raise_if_other_boot() -> None:
-                if watch.other_boots != other_boots:
-                    raise OperationRejected(f"erase logs: {OTHER_BOOT}; the previous vehicle may have erased its logs")
-
+            raise_if_other_boot = partial(
+                watch.raise_if_other_boot,
+                watch.other_boots,
+                "the previous vehicle may have erased its logs",
+                action="erase logs",
+            )
             remaining = await self._entries(IDLE_TIMEOUT_S)
             raise_if_other_boot()
             progress_at = self._transfers.connection.now()

@@ -184,7 +184,7 @@ class PlanChannel:
         finally:
             # If this call was cancelled, the transfer is also cancelled on the vehicle. A reopened link may lead to
             # another vehicle, which may have a transfer with another station.
-            is_same_boot = session.watch.other_boots == other_boots and not connection.is_held_back(session.system_id)
+            is_same_boot = session.watch.other_boots == other_boots and not session.is_held_back
             if not exchange.done and connection.is_open and is_same_boot:
                 for cancellation in exchange.cancellation():
                     connection.send(cancellation)

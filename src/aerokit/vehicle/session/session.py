@@ -42,7 +42,7 @@ from aerokit.vehicle.session.commands import CommandSender
 from aerokit.vehicle.session.rates import MessageRates
 from aerokit.vehicle.session.subscriber import ComponentSubscriber, WatchedStream
 from aerokit.vehicle.session.transfers import Transfers
-from aerokit.vehicle.session.watch import OTHER_BOOT, LinkWatch, VehicleWatch
+from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
 from aerokit.vehicle.state.field import MESSAGE_IDS
 from aerokit.vehicle.state.states import STATES
 from aerokit.vehicle.state.telemetry import Telemetry
@@ -268,6 +268,11 @@ class VehicleSession:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
+    @property
+    def is_held_back(self) -> bool:
+        """True from a loss of the link until the vehicle's clock shows that it is the same boot of the same vehicle."""
+        return self.connection.is_held_back(self.system_id)
+
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
         """Wait for a HEARTBEAT received after ``since``, by default after this call.
 
@@ -281,8 +286,7 @@ class VehicleSession:
         await armed.wait_until(
             lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
         )
-        if self.watch.other_boots != other_boots:
-            raise OperationRejected(f"{OTHER_BOOT}; nothing was sent over this link")
+        self.watch.raise_if_other_boot(other_boots, "nothing was sent over this link")
 
     def is_answer(self, ack: CommandAck, command: int) -> bool:
         frame = ack.received_frame
@@ -439,7 +443,7 @@ class VehicleSession:
 
     def _on_second(self) -> None:
         self.watch.check()
-        if self.connection.is_held_back(self.system_id):
+        if self.is_held_back:
             self.link_watch.request_time()
         self.telemetry.expire(self.connection.now())
 

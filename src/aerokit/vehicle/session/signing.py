@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
+from aerokit.errors import NotSupported, OperationTimeout
 from aerokit.mavlink.messages import SetupSigning
-from aerokit.vehicle.session.watch import OTHER_BOOT
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
@@ -34,9 +33,10 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
     with connection._signatures.key_handover(signing, session.system_id, session.component_id) as has_accepted:
         with anyio.move_on_after(timeout):
             while not has_accepted.is_set():
-                if session.watch.other_boots != other_boots:
-                    raise OperationRejected(f"setup_signing: {OTHER_BOOT}; the previous vehicle may have taken the key")
-                if not connection.is_held_back(session.system_id):
+                session.watch.raise_if_other_boot(
+                    other_boots, "the previous vehicle may have taken the key", action="setup_signing"
+                )
+                if not session.is_held_back:
                     session.send(_message(session, signing))
                 with anyio.move_on_after(RETRY_INTERVAL_S):
                     await has_accepted.wait()

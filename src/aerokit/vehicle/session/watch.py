@@ -12,7 +12,7 @@ import anyio
 from aerokit.connection.cells import StateCell
 from aerokit.connection.heartbeats import LinkStateTracker
 from aerokit.connection.loop_watch import BLOCKED_THRESHOLD_S, CHECK_INTERVAL_S
-from aerokit.errors import LinkLost
+from aerokit.errors import LinkLost, OperationRejected
 from aerokit.events import (
     SILENT_AFTER_S,
     LinkInterrupted,
@@ -164,6 +164,12 @@ class VehicleWatch:
         ):
             self._clock_handlers[message_type.ID] = handler
             self._detach_callbacks.append(bus.attach_frames(message_type, handler, system_id=system_id))
+
+    def raise_if_other_boot(self, other_boots_before: int, consequence: str, *, action: str = "") -> None:
+        """Raise OperationRejected if `other_boots` has grown: the reopened link may lead to another vehicle."""
+        if self.other_boots != other_boots_before:
+            prefix = f"{action}: " if action else ""
+            raise OperationRejected(f"{prefix}{OTHER_BOOT}; {consequence}")
 
     @property
     def is_silent(self) -> bool:
