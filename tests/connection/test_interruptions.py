@@ -15,7 +15,7 @@ import anyio
 import pytest
 from leak_check import run_and_do
 
-from aerokit import Signing, SigningKey, Vehicle, connect, events, open_connection
+from aerokit import LinkState, Signing, SigningKey, Vehicle, connect, events, open_connection
 from aerokit import messages as m
 from aerokit.connection.connection import Connection
 from aerokit.errors import (
@@ -530,6 +530,8 @@ class TestServers:
             with vehicle.subscribe(events.LinkRestored) as restored:
                 async with open_simulator(copter, address, speedup=20):
                     await restored.get(20)
+                    # A simulation of this speed may count as another vehicle first, which ends orders in progress.
+                    await vehicle.link_state.wait_until(lambda state: state is LinkState.CONNECTED, timeout=20)
                     await vehicle.position.wait_until(lambda _: vehicle.position.age < 1, timeout=20)
                     await vehicle.arm()
                     assert len(await vehicle.parameters.download()) > 100

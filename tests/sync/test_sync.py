@@ -296,6 +296,8 @@ def test_reconnecting_link(copter: SimulatedCopter) -> None:
             vehicle.wait_ready()
         with served([copter], address.replace("tcp:", "tcpin:")):
             restored.get(timeout=100)
+            # A simulation of this speed may count as another vehicle first, which ends orders in progress.
+            vehicle.link_state.wait_until(lambda state: state is LinkState.CONNECTED, timeout=100)
             vehicle.position.wait_until(lambda _: vehicle.position.age < 1, timeout=100)
             vehicle.arm()
             assert vehicle.is_armed
