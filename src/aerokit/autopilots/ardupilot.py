@@ -185,7 +185,7 @@ class ArduPilot(Autopilot):
     sets_current_by_command = True
     accepts_ftp_session_ids = True
     has_upper_case_parameters = True
-    plan_size_parameters = frozenset(("FENCE_TOTAL", "MIS_TOTAL", "RALLY_TOTAL"))
+    plan_size_parameters: frozenset[str] = frozenset(("FENCE_TOTAL", "MIS_TOTAL", "RALLY_TOTAL"))
     external: ExternalRules = ARDUPILOT_EXTERNAL
     log_suffix = ".bin"
     video_addresses_camera = True
