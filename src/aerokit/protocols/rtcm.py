@@ -9,8 +9,6 @@ from aerokit.errors import InvalidArgument
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import GpsRtcmData
 
-__all__ = ["MAX_MESSAGE_SIZE", "RtcmReader", "crc24q", "fragments", "message_number", "rtcm_messages"]
-
 PREAMBLE, HEADER_SIZE, CRC_SIZE = 0xD3, 3, 3
 FRAGMENT_SIZE, MAX_FRAGMENTS = 180, 4
 MAX_MESSAGE_SIZE = FRAGMENT_SIZE * MAX_FRAGMENTS
