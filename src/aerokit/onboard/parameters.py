@@ -9,28 +9,29 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.files import read_text, write_atomically
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamError, MavParamExtType, MavSeverity, ParamAck
-from aerokit.parameters import ParameterMetadata, check_name
-from aerokit.parameters.parameter import checked_setting, settings_equal, to_float32
-from aerokit.protocols.servers.parameters import (
-    ParameterRefusal,
-    TypedExtendedServer,
-    TypedParameterServer,
-    fits_param_value,
-)
+from aerokit.parameters import Parameter, ParameterMetadata, ParameterType, check_name
+from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
+from aerokit.parameters.parameter import checked_setting, setting_value, settings_equal, to_float32
+from aerokit.protocols.servers.host import sender_of
+from aerokit.protocols.servers.parameters import ExtendedParameterServer, ParameterProtocolServer
 
 if TYPE_CHECKING:
+    from aerokit.mavlink import messages as m
     from aerokit.onboard.host import ComponentHost
+    from aerokit.protocols.servers.host import Channel
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 LIST_RATE_HZ = 200.0
 MAX_COMPONENT_PARAMETERS = 1000
+MAX_LISTS = 8
+"""Maximum number of lists that a component sends at once; it ignores further requests."""
 
 ParameterValue = int | float | str
 OnSet = Callable[[ParameterValue], object]
@@ -68,8 +69,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._stored: dict[str, Any] = _read_stored(path)  # values that were in the file at the start
         self._is_dirty = False  # True if the file does not contain the last change
         self._save_task: asyncio.Task[None] | None = None  # None while the file is not being written
-        self._param_server = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
-        self._param_ext_server: TypedExtendedServer | None = None
+        self._param_server = _ParameterServer(host, self, bytewise=bytewise)
+        self._param_ext_server: _ExtendedServer | None = None
         self._has_camera_settings = False
 
     def add(
@@ -128,12 +129,12 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             except InvalidArgument as error:
                 logger.warning("%s: the default is used instead of the stored value: %s", self._path, error)
         self._rows[name] = row
-        if fits_param_value(row.type):
+        if row.type != MavParamExtType.CUSTOM:
             self._numeric_names.append(name)
         # Create the server only when the first parameter is added, because a component without parameters may use
         # PARAM_EXT for the settings of a camera.
         if self._param_ext_server is None:
-            self._param_ext_server = TypedExtendedServer(self._host, _Store(self))
+            self._param_ext_server = _ExtendedServer(self._host, self)
 
     def _forbid_parameters(self) -> None:
         """Refuse :meth:`add` from now on. Raise InvalidArgument if there are parameters already."""
@@ -164,8 +165,9 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             InvalidArgument: there is no such parameter, or the value is not allowed.
         """
         row = self._row(name)
-        self._store(name, self._checked(row, value))
-        self._param_server.publish(name)
+        self._store(row, self._checked(row, value))
+        if name in self._numeric_names:
+            self._param_server.send(name, self._numeric_names.index(name), None)
 
     def metadata(self, name: str) -> ParameterMetadata:
         """Return unit, range and description of a parameter; raise InvalidArgument if there is no such parameter."""
@@ -207,15 +209,34 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             raise InvalidArgument(problem)
         return checked
 
-    def _store(self, name: str, value: ParameterValue) -> None:
-        row = self._rows[name]
+    def _refusal(self, row: _Row, value: object, type_: int) -> _Refusal | None:
+        """Return the reason if a value of another program must not be stored, otherwise None."""
+        if row.metadata.read_only:
+            return _Refusal(MavParamError.READ_ONLY, ParamAck.FAILED)
+        if type_ != row.type:
+            return _Refusal(MavParamError.TYPE_MISMATCH, ParamAck.VALUE_UNSUPPORTED)
+        try:
+            checked = self._checked(row, value)
+            if row.on_set is not None:
+                row.on_set(checked)  # The program's function refuses a value by an exception.
+        except InvalidArgument as error:
+            self._host.send_text(MavSeverity.WARNING, str(error))
+            return _Refusal(MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED)
+        except Exception as error:
+            self._host.report_error(row.metadata.name, error)
+            return _Refusal(MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED)
+        return None
+
+    def _store(self, row: _Row, value: ParameterValue) -> bool:
+        """Store an allowed value. Return False if it is the present value."""
         if settings_equal(row.value, value):
-            return
+            return False
         row.value = value
         if self._path is not None:
             self._is_dirty = True
             if self._save_task is None:  # A running task writes the file again.
                 self._save_task = asyncio.get_running_loop().create_task(self._save(self._path))
+        return True
 
     def _file_text(self) -> str:
         values = {name: row.value for name, row in self._rows.items() if not row.metadata.read_only}
@@ -249,49 +270,89 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return json.dumps({"version": 1, "parameters": [_metadata_entry(row) for row in rows]}).encode()
 
 
-class _Store:
-    """Gives the protocol servers access to the parameters."""
+class _Refusal(NamedTuple):
+    """Reason why a value is not stored: a MAV_PARAM_ERROR, and the PARAM_ACK for the extended protocol."""
 
-    def __init__(self, parameters: ComponentParameters) -> None:
-        self._parameters = parameters
+    error: MavParamError
+    ack: ParamAck
+
+
+class _ParameterServer(ParameterProtocolServer):
+    """PARAM server of a component. It encodes values bytewise or casts them to float.
+
+    A refused PARAM_SET is answered with PARAM_ERROR, and with PARAM_VALUE (the unchanged value) for clients that do not
+    know PARAM_ERROR. Texts do not fit into PARAM_VALUE, and are left out.
+    """
+
+    def __init__(self, host: ComponentHost, parameters: ComponentParameters, *, bytewise: bool) -> None:
+        self._parameters, self._bytewise = parameters, bytewise
+        super().__init__(host, self, list_rate_hz=LIST_RATE_HZ)
+
+    @property
+    def names(self) -> list[str]:
+        return self._parameters._numeric_names
+
+    def value_message(self, name: str, index: int) -> m.ParamValue:
+        row = self._parameters._rows[name]
+        assert isinstance(row.value, (int, float))
+        position = None if index == UNKNOWN_INDEX else index
+        parameter = Parameter(name, row.value, ParameterType(row.type), index=position)
+        return value_message(parameter, len(self.names), bytewise=self._bytewise)
+
+    def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
+        if channel in self._lists or len(self._lists) < MAX_LISTS:
+            self.start_list(channel)
+
+    def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
+        name, index = request.param_id, request.param_index
+        if not self.send_requested(name, index, channel):
+            unknown_name = name if index < 0 else ""
+            self.send_error(sender_of(request), unknown_name, index, MavParamError.DOES_NOT_EXIST, channel)
+
+    def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
+        name, names, parameters = request.param_id, self.names, self._parameters
+        if name not in names:
+            self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
+            return
+        row = parameters._rows[name]
+        value = value_of(request, bytewise=self._bytewise)
+        # If values are cast to float, the received type is ignored: ArduPilot's clients send all values as REAL32.
+        refusal = parameters._refusal(row, value, request.param_type if self._bytewise else row.type)
+        if refusal is not None:
+            self.send_error(sender_of(request), name, names.index(name), refusal.error, channel)
+            self.send(name, names.index(name), channel)
+            return
+        is_changed = parameters._store(row, parameters._checked(row, value))
+        # A changed value is sent to all programs.
+        self.send(name, names.index(name), None if is_changed else channel)
+
+
+class _ExtendedServer(ExtendedParameterServer):
+    """PARAM_EXT server of a component, including texts."""
+
+    def __init__(self, host: ComponentHost, parameters: ComponentParameters) -> None:
+        self._rows, self._parameters = parameters._rows, parameters
+        super().__init__(host, self)
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(self._parameters._rows)
+        return tuple(self._rows)
 
-    @property
-    def param_names(self) -> list[str]:
-        return self._parameters._numeric_names
+    def value(self, name: str) -> tuple[ParameterValue, int]:
+        return self._rows[name].value, self._rows[name].type
 
     def __contains__(self, name: object) -> bool:
-        return name in self._parameters._rows
+        return name in self._rows
 
-    def __getitem__(self, name: str) -> ParameterValue:
-        return self._parameters._rows[name].value
-
-    def type(self, name: str) -> MavParamExtType:
-        return self._parameters._rows[name].type
-
-    def refusal(self, name: str, value: object, type: int) -> ParameterRefusal | None:  # noqa: A002
-        row = self._parameters._rows[name]
-        if row.metadata.read_only:
-            return ParameterRefusal(MavParamError.READ_ONLY, ParamAck.FAILED)
-        if type != row.type:
-            return ParameterRefusal(MavParamError.TYPE_MISMATCH, ParamAck.VALUE_UNSUPPORTED)
-        try:
-            checked = self._parameters._checked(row, value)
-            if row.on_set is not None:
-                row.on_set(checked)  # The program's function refuses a value by an exception.
-        except InvalidArgument as error:
-            self._parameters._host.send_text(MavSeverity.WARNING, str(error))
-            return ParameterRefusal(MavParamError.VALUE_OUT_OF_RANGE, ParamAck.VALUE_UNSUPPORTED)
-        except Exception as error:
-            self._parameters._host.report_error(name, error)
-            return ParameterRefusal(MavParamError.VALUE_OUT_OF_RANGE, ParamAck.FAILED)
-        return None
-
-    def store(self, name: str, value: object) -> None:
-        self._parameters._store(name, self._parameters._checked(self._parameters._rows[name], value))
+    def set(self, name: str, data: bytes, kind: int) -> int:
+        row, value = self._rows[name], setting_value(data, kind)
+        if isinstance(row.value, str) and value == b"":  # An empty text and empty bytes are the same on the wire.
+            value = ""
+        refusal = self._parameters._refusal(row, value, kind)
+        if refusal is not None:
+            return refusal.ack
+        self._parameters._store(row, self._parameters._checked(row, value))
+        return ParamAck.ACCEPTED
 
 
 def _rounded_limit(limit: float | None, default: ParameterValue) -> float | None:

@@ -1,4 +1,4 @@
-"""Servers for PARAM_* and PARAM_EXT_*, of typed parameters and of the settings in a camera definition file.
+"""Servers for PARAM_* and PARAM_EXT_*, and the server of the settings in a camera definition file.
 
 https://mavlink.io/en/services/parameter.html, https://mavlink.io/en/services/parameter_ext.html,
 https://mavlink.io/en/services/camera_def.html
@@ -7,18 +7,14 @@ https://mavlink.io/en/services/camera_def.html
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavParamError, MavParamExtType, ParamAck
-from aerokit.parameters import CameraDefinition, Parameter, ParameterType, SettingValue
-from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
+from aerokit.mavlink.enums import MavParamExtType, ParamAck
+from aerokit.parameters import CameraDefinition, SettingValue
 from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
-from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost, sender_of
-
-MAX_LISTS = 8
-"""Maximum number of lists that a component sends at once; it ignores further requests."""
+from aerokit.protocols.servers.host import Channel, ComponentIds, ServerHost
 
 
 class NamedList(Protocol):
@@ -124,98 +120,6 @@ class ParameterProtocolServer(ParameterLists):
         self._host.send(m.ParamError(*to, name, index, code), channel)
 
 
-class ParameterRefusal(NamedTuple):
-    """Reason why a value is not stored: a MAV_PARAM_ERROR, and the PARAM_ACK for the extended protocol."""
-
-    error: MavParamError
-    ack: ParamAck
-
-
-class TypedStore(NamedList, Protocol):
-    """Typed parameters of a component."""
-
-    @property
-    def param_names(self) -> Sequence[str]:
-        """Names of the parameters whose values fit into PARAM_VALUE.
-
-        This must be fast, because every PARAM_VALUE needs it.
-        """
-        ...
-
-    def __contains__(self, name: object) -> bool: ...
-
-    def __getitem__(self, name: str) -> SettingValue: ...
-
-    def type(self, name: str) -> MavParamExtType: ...
-
-    def refusal(self, name: str, value: SettingValue, type: int) -> ParameterRefusal | None:  # noqa: A002
-        """Return the reason if the value must not be stored, otherwise None."""
-        ...
-
-    def store(self, name: str, value: SettingValue) -> None: ...
-
-
-class TypedParameterServer(ParameterProtocolServer):
-    """PARAM server for typed parameters. It encodes values bytewise or casts them to float.
-
-    A refused PARAM_SET is answered with PARAM_ERROR, and with PARAM_VALUE (the unchanged value) for clients that do not
-    know PARAM_ERROR. Texts and 64-bit numbers do not fit into PARAM_VALUE, and are left out.
-    """
-
-    def __init__(self, host: ServerHost, store: TypedStore, *, bytewise: bool = True, list_rate_hz: float) -> None:
-        self.bytewise = bytewise
-        self._store = store
-        super().__init__(host, self, list_rate_hz=list_rate_hz)
-
-    @property
-    def names(self) -> Sequence[str]:
-        return self._store.param_names
-
-    def value_message(self, name: str, index: int) -> m.ParamValue:
-        value, type_ = self._store[name], ParameterType(self._store.type(name))
-        assert isinstance(value, (int, float))
-        parameter = Parameter(name, value, type_, index=None if index == UNKNOWN_INDEX else index)
-        return value_message(parameter, len(self.names), bytewise=self.bytewise)
-
-    def publish(self, name: str) -> None:
-        """Send a value to all programs. Does nothing if its type does not fit into PARAM_VALUE."""
-        if fits_param_value(self._store.type(name)):
-            self.send(name, self.names.index(name), None)
-
-    def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
-        if channel in self._lists or len(self._lists) < MAX_LISTS:
-            self.start_list(channel)
-
-    def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        name, index = request.param_id, request.param_index
-        if not self.send_requested(name, index, channel):
-            unknown_name = name if index < 0 else ""
-            self.send_error(sender_of(request), unknown_name, index, MavParamError.DOES_NOT_EXIST, channel)
-
-    def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
-        name, names, store = request.param_id, self.names, self._store
-        if name not in names:
-            self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
-            return
-        value = value_of(request, bytewise=self.bytewise)
-        # If values are cast to float, the received type is ignored: ArduPilot's clients send all values as REAL32.
-        refusal = store.refusal(name, value, request.param_type if self.bytewise else store.type(name))
-        if refusal is not None:
-            self.send_error(sender_of(request), name, names.index(name), refusal.error, channel)
-            self.send(name, names.index(name), channel)
-            return
-        old_value = store[name]
-        store.store(name, value)
-        is_unchanged = settings_equal(old_value, store[name])
-        # A changed value is sent to all programs.
-        self.send(name, names.index(name), channel if is_unchanged else None)
-
-
-def fits_param_value(type_: MavParamExtType) -> bool:
-    """Return True if the four bytes of PARAM_VALUE can hold values of this type."""
-    return type_ <= MavParamExtType.INT32 or type_ == MavParamExtType.REAL32
-
-
 class ExtendedParameterServer(ParameterLists):
     """Receives PARAM_EXT_REQUEST_LIST, PARAM_EXT_REQUEST_READ and PARAM_EXT_SET; subclasses store the values.
 
@@ -267,30 +171,6 @@ class ExtendedParameterServer(ParameterLists):
         value, kind = self.value(name)
         # All channels get the acknowledgement, because other clients read changes from it.
         self._host.send(m.ParamExtAck(name, setting_bytes(value, kind), kind, result))
-
-
-class TypedExtendedServer(ExtendedParameterServer):
-    """PARAM_EXT server for typed parameters, including texts."""
-
-    def __init__(self, host: ServerHost, store: TypedStore) -> None:
-        super().__init__(host, store)
-        self._store = store
-
-    def value(self, name: str) -> tuple[SettingValue, int]:
-        return self._store[name], self._store.type(name)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._store
-
-    def set(self, name: str, data: bytes, kind: int) -> int:
-        store, value = self._store, setting_value(data, kind)
-        if isinstance(store[name], str) and value == b"":  # An empty text and empty bytes are the same on the wire.
-            value = ""
-        refusal = store.refusal(name, value, kind)
-        if refusal is not None:
-            return refusal.ack
-        store.store(name, value)
-        return ParamAck.ACCEPTED
 
 
 _ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "string": "", "custom": ""}
