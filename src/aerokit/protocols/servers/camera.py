@@ -151,21 +151,21 @@ _CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
 
 
 def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
-    pictures, videos, settings = _Pictures(camera), _Videos(camera), _Settings(camera)
+    commands = _CameraCommands(camera)
     return {
-        MavCmd.IMAGE_START_CAPTURE: pictures.start_capture,
-        MavCmd.IMAGE_STOP_CAPTURE: pictures.stop_capture,
-        MavCmd.DO_DIGICAM_CONTROL: pictures.digicam_control,
-        MavCmd.STORAGE_FORMAT: pictures.format_storage,
-        MavCmd.VIDEO_START_CAPTURE: videos.start_capture,
-        MavCmd.VIDEO_STOP_CAPTURE: videos.stop_capture,
-        MavCmd.VIDEO_START_STREAMING: lambda command: videos.switch_stream(command, on=True),
-        MavCmd.VIDEO_STOP_STREAMING: lambda command: videos.switch_stream(command, on=False),
-        MavCmd.SET_CAMERA_MODE: settings.set_mode,
-        MavCmd.SET_CAMERA_ZOOM: settings.set_zoom,
-        MavCmd.SET_CAMERA_FOCUS: settings.set_focus,
-        MavCmd.SET_CAMERA_SOURCE: settings.set_source,
-        MavCmd.RESET_CAMERA_SETTINGS: settings.reset,
+        MavCmd.IMAGE_START_CAPTURE: commands.start_images,
+        MavCmd.IMAGE_STOP_CAPTURE: commands.stop_images,
+        MavCmd.DO_DIGICAM_CONTROL: commands.digicam_control,
+        MavCmd.STORAGE_FORMAT: commands.format_storage,
+        MavCmd.VIDEO_START_CAPTURE: commands.start_video,
+        MavCmd.VIDEO_STOP_CAPTURE: commands.stop_video,
+        MavCmd.VIDEO_START_STREAMING: lambda command: commands.switch_stream(command, on=True),
+        MavCmd.VIDEO_STOP_STREAMING: lambda command: commands.switch_stream(command, on=False),
+        MavCmd.SET_CAMERA_MODE: commands.set_mode,
+        MavCmd.SET_CAMERA_ZOOM: commands.set_zoom,
+        MavCmd.SET_CAMERA_FOCUS: commands.set_focus,
+        MavCmd.SET_CAMERA_SOURCE: commands.set_source,
+        MavCmd.RESET_CAMERA_SETTINGS: commands.reset_settings,
         MavCmd.CAMERA_TRACK_POINT: camera.tracking.track_point,
         MavCmd.CAMERA_TRACK_RECTANGLE: camera.tracking.track_rectangle,
         MavCmd.CAMERA_STOP_TRACKING: camera.tracking.stop,
@@ -190,14 +190,16 @@ def legacy_requests(streams: MessageStreams) -> dict[int, CommandHandler]:
     return {command: handler(message_id) for command, message_id in message_ids.items()}
 
 
-class _Pictures:
-    """Commands for images, series of images and the memory card."""
+class _CameraCommands:
+    """Handlers of the commands for images and the memory card, for videos and streams, and for settings."""
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self._last_single: tuple[ComponentIds, int] | None = None  # sender and sequence number of the last single image
+        self._must_stop_video = False  # True from a command to stop until the next command to start
+        self._was_cancelled = False  # True if the start of a video was cancelled, so that the camera may be recording
 
-    async def start_capture(self, command: ReceivedCommand) -> int:
+    async def start_images(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
         count = to_int(command.param3)
@@ -220,7 +222,7 @@ class _Pictures:
         captures.take_series(interval_s, count)
         return MavResult.ACCEPTED
 
-    async def stop_capture(self, command: ReceivedCommand) -> int:
+    async def stop_images(self, command: ReceivedCommand) -> int:
         if not _selects_this_camera(command.param1):
             return MavResult.DENIED
         self._camera.captures.stop()
@@ -229,7 +231,7 @@ class _Pictures:
     async def digicam_control(self, command: ReceivedCommand) -> int:
         if command.x != 1:  # Param 5 of DO_DIGICAM_CONTROL is 1 to take an image.
             return MavResult.ACCEPTED
-        return await self.start_capture(replace(command, param1=0.0, param2=0.0, param3=1.0, param4=0.0))
+        return await self.start_images(replace(command, param1=0.0, param2=0.0, param3=1.0, param4=0.0))
 
     async def format_storage(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures
@@ -243,16 +245,7 @@ class _Pictures:
             captures.clear()
         return MavResult.ACCEPTED
 
-
-class _Videos:
-    """Commands for recording and streaming."""
-
-    def __init__(self, camera: CameraDevice) -> None:
-        self._camera = camera
-        self._must_stop = False  # True from a command to stop until the next command to start
-        self._was_cancelled = False  # True if a start was cancelled, so that the camera may be recording
-
-    async def start_capture(self, command: ReceivedCommand) -> int:
+    async def start_video(self, command: ReceivedCommand) -> int:
         camera, captures = self._camera, self._camera.captures
         if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
             return MavResult.UNSUPPORTED
@@ -263,7 +256,7 @@ class _Videos:
             return MavResult.TEMPORARILY_REJECTED
         if camera.free_mib <= 0:
             return MavResult.FAILED
-        self._must_stop = False
+        self._must_stop_video = False
         try:
             await camera.start_video()
         except BaseException as error:
@@ -272,12 +265,12 @@ class _Videos:
         # Param 2 of VIDEO_START_CAPTURE is the rate of CAMERA_CAPTURE_STATUS in Hz; 0 requests no status.
         status_interval_s = 1.0 / command.param2 if command.param2 else 0.0
         captures.record(status_interval_s)
-        if self._must_stop:  # The command to stop arrived while the camera was starting.
+        if self._must_stop_video:  # The command to stop arrived while the camera was starting.
             await self._stop_recording()
         return MavResult.ACCEPTED
 
-    async def stop_capture(self, _: ReceivedCommand) -> int:
-        self._must_stop = True
+    async def stop_video(self, _: ReceivedCommand) -> int:
+        self._must_stop_video = True
         await self._stop_recording()
         return MavResult.ACCEPTED
 
@@ -302,13 +295,6 @@ class _Videos:
         else:
             camera.running_streams -= selected
         return MavResult.ACCEPTED
-
-
-class _Settings:
-    """Commands for mode, zoom and focus. Each command sends CAMERA_SETTINGS."""
-
-    def __init__(self, camera: CameraDevice) -> None:
-        self._camera = camera
 
     async def set_mode(self, command: ReceivedCommand) -> int:
         camera, mode = self._camera, to_int(command.param2)
@@ -348,7 +334,7 @@ class _Settings:
         self._camera.source = source
         return MavResult.ACCEPTED
 
-    async def reset(self, command: ReceivedCommand) -> int:
+    async def reset_settings(self, command: ReceivedCommand) -> int:
         if command.param1 == 1.0:
             await self._camera.reset_settings()
         return self._send_settings()
