@@ -13,7 +13,7 @@ from aerokit.errors import BusyError, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState, MavType
 from aerokit.onboard import CommandRequest, Identity
-from aerokit.onboard.events import MAX_STORED_EVENTS
+from aerokit.onboard.host import MAX_STORED_EVENTS
 from aerokit.transport import memory_link_pair
 
 pytestmark = pytest.mark.anyio

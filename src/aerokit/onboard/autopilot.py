@@ -12,8 +12,7 @@ from aerokit.missions.item import canonical_frame
 from aerokit.onboard.commands import overrides
 
 if TYPE_CHECKING:
-    from aerokit.onboard.commands import CommandRequest
-    from aerokit.onboard.services import ComponentServices
+    from aerokit.onboard.commands import CommandRequest, ComponentServices
 
 FORCE = 21196
 """Value of param 2 in the MAVLink standard, which forces arming and disarming."""

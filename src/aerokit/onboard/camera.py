@@ -32,8 +32,8 @@ from aerokit.protocols.servers.parameters import DefinedParameterServer
 
 if TYPE_CHECKING:
     from aerokit.connection.tasks import BackgroundTasks
+    from aerokit.onboard.commands import ComponentServices
     from aerokit.onboard.host import ComponentHost
-    from aerokit.onboard.services import ComponentServices
     from aerokit.parameters import CameraDefinition, SettingValue
     from aerokit.protocols.servers.camera import AsyncHandler
     from aerokit.protocols.servers.commands import ReceivedCommand

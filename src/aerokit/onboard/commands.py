@@ -1,33 +1,40 @@
-"""Runs the command handlers of a component (functions or coroutine functions): progress, cancellation, results."""
+"""Runs the command handlers of a component: progress, cancellation, results. `ComponentServices` has all servers."""
 
 from __future__ import annotations
 
 import asyncio
 import contextvars
 import inspect
+import logging
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Any
+
+import anyio
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck
 from aerokit.missions.item import canonical_frame, command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
 from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, CommandResult, RunningCommands
+from aerokit.protocols.servers.files import FileTree
+from aerokit.protocols.servers.intervals import MessageStreams
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.host import ComponentHost
+    from aerokit.onboard.parameters import ComponentParameters
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
     from aerokit.protocols.servers.host import ComponentIds
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # Two more for a series of pictures and the check of an upload.
 
@@ -312,3 +319,70 @@ class _Execution:
             name = command_name(self._running.command.command)
         self._commands._host.report_error(name, error)
         self._finish(CommandResult(result_of(error)))
+
+
+MAX_STREAMS = 64
+MIN_STREAM_INTERVAL_S = 0.005
+STOP_TIMEOUT_S = 2.0
+
+
+class ComponentServices:
+    """The command handlers, message streams, parameters and in-memory files of one component."""
+
+    def __init__(self, host: ComponentHost, tasks: BackgroundTasks, parameters: ComponentParameters) -> None:
+        self.host: ComponentHost = host
+        self.tasks: BackgroundTasks = tasks
+        self.parameters: ComponentParameters = parameters
+        self.commands: ComponentCommands = ComponentCommands(host, tasks)
+        self.streams: MessageStreams = MessageStreams(
+            host, min_interval_s=MIN_STREAM_INTERVAL_S, max_streams=MAX_STREAMS
+        )
+        self.commands.add_guarded(self.streams.commands())
+        self.memory: FileTree = FileTree()
+        self.stop_functions: dict[str, Callable[[], Any]] = {}
+        """Maps the name of a moving part, e.g. "winch", to the program's function that stops it."""
+
+    async def stop_motions(self) -> None:
+        thread_calls = set(self.commands.thread_calls)
+        stop_functions = dict(self.stop_functions)
+        self.stop_functions.clear()
+        await self._call_all(stop_functions)
+        if stop_functions and thread_calls:  # One of these threads may have started the motion again.
+            await asyncio.wait(thread_calls, timeout=STOP_TIMEOUT_S)
+            await self._call_all(stop_functions)
+
+    async def _call_all(self, stop_functions: Mapping[str, Callable[[], Any]]) -> None:
+        for part, stop in stop_functions.items():
+            try:
+                with anyio.fail_after(STOP_TIMEOUT_S):
+                    await self.commands.call(stop)
+            except (Exception, asyncio.CancelledError) as error:  # e.g. the driver awaits a task that it has cancelled
+                self.host.report_error(f"stopping the {part}", error)
+
+    def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:
+        """Send the message that ``function`` returns: on request, and at a rate of ``hz``.
+
+        Raises InvalidArgument if the rate is not 0 to 200 Hz, or the message already has a function.
+        """
+        if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
+            raise InvalidArgument(f"hz = {hz} is not allowed: it must be 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
+        if message_type.ID in self.streams.builders:
+            raise InvalidArgument(f"{message_type.NAME} already has a function")
+
+        is_failing = False
+
+        def build(_: object) -> Iterable[Message]:
+            nonlocal is_failing
+            try:
+                message = function()
+            except Exception:
+                if not is_failing:  # Log the first failure only.
+                    logger.exception("the function for %s failed", message_type.NAME)
+                is_failing = True
+                return []
+            is_failing = False
+            return [] if message is None else [message]
+
+        self.streams.builders[message_type.ID] = build
+        if hz > 0:
+            self.streams.stream(message_type.ID, 1.0 / hz)

@@ -16,13 +16,12 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.enums import MavProtocolCapability as Capability
 from aerokit.mavlink.message import Message
-from aerokit.onboard.events import EventSender, answer_pings, check_severity
+from aerokit.onboard.commands import ComponentServices
 from aerokit.onboard.files import DirectoryFiles
-from aerokit.onboard.host import ComponentHost
+from aerokit.onboard.host import ComponentHost, EventSender, answer_pings, check_severity
 from aerokit.onboard.identity import PARAMETER_PATH, Identity, IdentityMessages
 from aerokit.onboard.missions import ComponentMissions
 from aerokit.onboard.parameters import ComponentParameters
-from aerokit.onboard.services import ComponentServices
 from aerokit.protocols.servers.ftp import SessionFtpServer
 
 if TYPE_CHECKING:

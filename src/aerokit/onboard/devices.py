@@ -16,8 +16,7 @@ from aerokit.onboard.host import error_text
 from aerokit.protocols.servers.commands import CommandResult
 
 if TYPE_CHECKING:
-    from aerokit.onboard.commands import CommandRequest
-    from aerokit.onboard.services import ComponentServices
+    from aerokit.onboard.commands import CommandRequest, ComponentServices
 
 Authorize = Callable[[int], "float | Awaitable[float]"]
 

@@ -23,7 +23,7 @@ from aerokit.protocols.servers.gimbal import (
 )
 
 if TYPE_CHECKING:
-    from aerokit.onboard.services import ComponentServices
+    from aerokit.onboard.commands import ComponentServices
     from aerokit.protocols.servers.host import ServerHost
 
 STATUS_INTERVAL_S = 1.0

@@ -15,8 +15,7 @@ from aerokit.missions.check import check_items
 from aerokit.protocols.servers.missions import MissionServer
 
 if TYPE_CHECKING:
-    from aerokit.onboard.commands import CommandRequest
-    from aerokit.onboard.services import ComponentServices
+    from aerokit.onboard.commands import CommandRequest, ComponentServices
 
 _TYPES_BY_KIND = {"mission": MavMissionType.MISSION, "fence": MavMissionType.FENCE, "rally": MavMissionType.RALLY}
 
