@@ -175,6 +175,32 @@ def number(low: float, high: float) -> Callable[[str], float]:
     return parse
 
 
+def add_number(
+    command: argparse._ActionsContainer,
+    name: str,
+    low: float,
+    high: float,
+    metavar: str,
+    text: str,
+    *,
+    default: float | None = None,
+) -> None:
+    """Add an option or argument for a number from ``low`` to ``high``. The help text ends with the default, if any."""
+    shown_default = "" if default is None else f" (default: {default:g})"
+    command.add_argument(name, type=number(low, high), default=default, metavar=metavar, help=f"{text}{shown_default}")
+
+
+def add_repeatable(command: argparse._ActionsContainer, name: str, metavar: str, text: str, **keywords: Any) -> None:
+    """Add an option that can be given several times. Its value is a list."""
+    command.add_argument(name, action="append", default=[], metavar=metavar, help=f"{text} (repeatable)", **keywords)
+
+
+def add_system_id(command: argparse._ActionsContainer) -> None:
+    command.add_argument(
+        "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
+    )
+
+
 def assignment(text: str) -> tuple[str, int | float]:
     """Parse ``NAME=VALUE`` for a parameter.
 

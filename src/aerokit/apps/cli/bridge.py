@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.apps.cli.arguments import address, number, port
+from aerokit.apps.cli.arguments import add_number, add_repeatable, address, port
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, opened
 from aerokit.apps.cli.output import DONE, add_json, can_print, emit, import_extra
 from aerokit.apps.cli.terminal import on_interrupt
@@ -43,13 +43,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     foxglove.add_argument(
         "--port", type=port, default=8765, help="TCP port to listen on; 0: any free port (default: 8765)"
     )
-    foxglove.add_argument(
-        "--messages",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="show these MAVLink messages too, unconverted: 'GPS_*' (repeatable)",
-    )
+    add_repeatable(foxglove, "--messages", "NAME", "show these MAVLink messages too, unconverted: 'GPS_*'")
     _add_common(foxglove, rate_of="topic", default_hz=10.0, max_hz=100.0)
     zenoh = _add_publishing(actions, "zenoh", "to a zenoh network")
     zenoh.set_defaults(required_module="zenoh", extra="zenoh", printable_network=str)
@@ -87,13 +81,7 @@ def _add_publishing(
 
 def _add_common(action: argparse.ArgumentParser, *, rate_of: str, default_hz: float, max_hz: float) -> None:
     """Add the options that all bridges have. ``rate_of`` is what ``--rate`` limits: "topic" or "state"."""
-    action.add_argument(
-        "--rate",
-        type=number(0.1, max_hz),
-        default=default_hz,
-        metavar="HZ",
-        help=f"maximum rate of each {rate_of} (default: {default_hz:g})",
-    )
+    add_number(action, "--rate", 0.1, max_hz, "HZ", f"maximum rate of each {rate_of}", default=default_hz)
     action.add_argument(
         "--listen-only",
         action="store_true",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import anyio
 import anyio.lowlevel
 
-from aerokit.apps.cli.arguments import system_id
+from aerokit.apps.cli.arguments import add_system_id
 from aerokit.apps.cli.connecting import add_link, connect_to, signing_of
 from aerokit.apps.cli.output import DONE, INTERRUPTED, emit
 from aerokit.apps.cli.terminal import CLEAR_LINE, on_interrupt, wait_for_enter
@@ -84,9 +84,7 @@ PICTURES: dict[CalibrationPose, str] = {
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("sensor", choices=_SENSORS, help="what to calibrate")
     add_link(command)
-    command.add_argument(
-        "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
-    )
+    add_system_id(command)
     command.add_argument(
         "--propellers-removed", action="store_true", help="for escs: confirms that no propeller is mounted"
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.apps.cli.arguments import add_baud, address, number, system_id
+from aerokit.apps.cli.arguments import add_baud, add_number, add_system_id, address, number, system_id
 from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.output import DONE, add_json, emit, emit_done
 from aerokit.apps.cli.terminal import confirm, is_interactive, on_interrupt, showing_countdown
@@ -140,16 +140,8 @@ def _vehicle_parser() -> argparse.ArgumentParser:
 def add_vehicle(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("vehicle")
     add_address(group, "--connect")
-    group.add_argument(
-        "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
-    )
-    group.add_argument(
-        "--patience",
-        type=number(0.1, 3600),
-        default=10.0,
-        metavar="S",
-        help="time out after S seconds without progress (default: 10)",
-    )
+    add_system_id(group)
+    add_number(group, "--patience", 0.1, 3600, "S", "time out after S seconds without progress", default=10.0)
     add_signing_key(group, f"signing key of the vehicle (${SIGNING_KEY_VARIABLE})")
 
 

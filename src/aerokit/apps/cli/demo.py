@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.arguments import add_faults, add_vehicle_kind, number, system_id, writable_file
+from aerokit.apps.cli.arguments import add_faults, add_number, add_system_id, add_vehicle_kind, writable_file
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, connect_to, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
@@ -32,12 +32,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_address(command, "--connect", what="vehicle to fly: ", default_text="a simulated one")
     add_vehicle_kind(command, "copter or plane with ArduPilot, px4 or px4_plane (default: copter)")
     add_faults(command)
-    command.add_argument(
-        "--altitude", type=number(1, 500), default=10.0, metavar="M", help="altitude above home in metres (default: 10)"
-    )
-    command.add_argument(
-        "--side", type=number(1, 5000), default=20.0, metavar="M", help="side of the square in metres (default: 20)"
-    )
+    add_number(command, "--altitude", 1, 500, "M", "altitude above home in metres", default=10.0)
+    add_number(command, "--side", 1, 5000, "M", "side of the square in metres", default=20.0)
     command.add_argument(
         "--record",
         type=writable_file,
@@ -45,12 +41,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=f"record all messages (default: {_DEFAULT_LOG}; an existing file is kept as demo.1.tlog)",
     )
-    command.add_argument(
-        "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="simulation speed factor (default: 5)"
-    )
-    command.add_argument(
-        "--system-id", type=system_id, metavar="ID", help="system id of the vehicle (default: the only one)"
-    )
+    add_number(command, "--speedup", 0.1, 100, "X", "simulation speed factor", default=5.0)
+    add_system_id(command)
     add_signing_key(command, f"signing key of the --connect vehicle (${SIGNING_KEY_VARIABLE})")
     add_json(command)
 

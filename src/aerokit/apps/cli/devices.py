@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import anyio
 
-from aerokit.apps.cli.arguments import directory, integer, number
+from aerokit.apps.cli.arguments import add_number, directory, integer, number
 from aerokit.apps.cli.connecting import add_action, command_action, connected, is_declined
 from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
 from aerokit.errors import AerokitError
@@ -41,9 +41,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of pictures (default: 1)",
     )
-    photo.add_argument(
-        "--interval", type=number(0.1, 3600), default=2.0, metavar="S", help="seconds between pictures (default: 2)"
-    )
+    add_number(photo, "--interval", 0.1, 3600, "S", "seconds between pictures", default=2.0)
     photo.add_argument(
         "--to",
         type=directory,
@@ -187,9 +185,7 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
     info = add_action(actions, "info", _gimbal_info, "Show model, limits and attitude.")
     run_point = command_action("gimbal point", "pointing at pitch {pitch:g}°, yaw {yaw:g}°", _point, _gimbal)
     point = add_action(actions, "point", run_point, "Point the gimbal, and hold the direction.")
-    point.add_argument(
-        "pitch", type=number(-360, 360), metavar="PITCH", help="degrees from the horizon: -90 is straight down"
-    )
+    add_number(point, "pitch", -360, 360, "PITCH", "degrees from the horizon: -90 is straight down")
     point.add_argument(
         "yaw", type=number(-360, 360), nargs="?", default=0.0, metavar="YAW", help="degrees to the right (default: 0)"
     )

@@ -10,7 +10,7 @@ import anyio
 
 from aerokit import events
 from aerokit._internal.formatting import format_value
-from aerokit.apps.cli.arguments import add_conditions, add_record, conditions, number, vehicle_kind
+from aerokit.apps.cli.arguments import add_conditions, add_number, add_record, conditions, vehicle_kind
 from aerokit.apps.cli.completion import kinds, set_completions
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
@@ -190,13 +190,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         default="return",
         help="what the vehicle does after Ctrl-C in the air; a second Ctrl-C exits without it (default: return)",
     )
-    command.add_argument(
-        "--ready",
-        type=number(0, 3600),
-        default=120.0,
-        metavar="S",
-        help="seconds to wait until the vehicle is ready to arm (default: 120)",
-    )
+    add_number(command, "--ready", 0, 3600, "S", "seconds to wait until the vehicle is ready to arm", default=120.0)
     add_max_distance(command)
     simulated = command.add_argument_group("simulated")
     simulated.add_argument(
@@ -206,9 +200,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--vehicle", type=vehicle_kind, metavar="KIND", help="copter, plane, px4 … (default: the plan's vehicle type)"
     )
     set_completions(kind, kinds)
-    simulated.add_argument(
-        "--speedup", type=number(0.1, 100), default=10.0, metavar="X", help="simulation speed factor (default: 10)"
-    )
+    add_number(simulated, "--speedup", 0.1, 100, "X", "simulation speed factor", default=10.0)
     add_conditions(simulated)
     add_record(command)
     add_vehicle(command)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.apps.cli.arguments import add_baud, add_record, address, number
+from aerokit.apps.cli.arguments import add_baud, add_number, add_record, add_repeatable, address
 from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, signing_of
 from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, can_print, emit, new_recording, suggestion
@@ -17,7 +17,7 @@ from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
 
@@ -36,29 +36,21 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         " NAME, or by ADDRESS as written",
     )
     set_completions(endpoints, addresses)
-    _add_names(command, "--read-only", "do not forward messages received there, heartbeats included")
-    _add_names(command, "--patient", "if it cannot be opened, start without it and keep trying")
+    add_repeatable(command, "--read-only", "NAME", "do not forward messages received there, heartbeats included")
+    add_repeatable(command, "--patient", "NAME", "if it cannot be opened, start without it and keep trying")
     only = f"send only these messages, to one endpoint or, without @NAME, to each: {_FILTER_EXAMPLE}"
-    _add_filter(command, "--only", _parse_filter, only)
-    _add_filter(command, "--block", _parse_filter, f"do not send these messages: {_FILTER_EXAMPLE}")
-    _add_filter(command, "--rate", _parse_rates, "limit messages to a rate in Hz, for each sender: 'ATTITUDE=5@NAME'")
-    _add_names(command, "--signed", "sign what is sent there, and accept only signed messages")
+    block = f"do not send these messages: {_FILTER_EXAMPLE}"
+    rate = "limit messages to a rate in Hz, for each sender: 'ATTITUDE=5@NAME'"
+    add_repeatable(command, "--only", "FILTER", only, type=_parse_filter)
+    add_repeatable(command, "--block", "FILTER", block, type=_parse_filter)
+    add_repeatable(command, "--rate", "FILTER", rate, type=_parse_rates)
+    add_repeatable(command, "--signed", "NAME", "sign what is sent there, and accept only signed messages")
     add_signing_key(command, f"key for --signed (${SIGNING_KEY_VARIABLE})")
     add_baud(command)
     add_record(command)
-    command.add_argument(
-        "--every", type=number(0.1, 1e6), default=10.0, metavar="S", help="seconds between statistics (default: 10)"
-    )
-    command.add_argument("--seconds", type=number(0.1, 1e6), metavar="S", help="stop after S seconds")
+    add_number(command, "--every", 0.1, 1e6, "S", "seconds between statistics", default=10.0)
+    add_number(command, "--seconds", 0.1, 1e6, "S", "stop after S seconds")
     add_json(command)
-
-
-def _add_names(command: argparse.ArgumentParser, option: str, text: str) -> None:
-    command.add_argument(option, action="append", default=[], metavar="NAME", help=f"{text} (repeatable)")
-
-
-def _add_filter(command: argparse.ArgumentParser, option: str, parse: Callable[[str], object], text: str) -> None:
-    command.add_argument(option, action="append", default=[], type=parse, metavar="FILTER", help=f"{text} (repeatable)")
 
 
 def _named_address(text: str) -> tuple[str, str]:

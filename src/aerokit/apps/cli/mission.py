@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.files import read_text
-from aerokit.apps.cli.arguments import number, writable_file
+from aerokit.apps.cli.arguments import add_number, writable_file
 from aerokit.apps.cli.completion import set_completions
 from aerokit.apps.cli.connecting import add_action, command_action, connected
 from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, suggestion
@@ -169,13 +169,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def add_max_distance(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--max-distance-m",
-        type=number(1, 1e8),
-        default=MAX_DISTANCE_M,
-        metavar="M",
-        help="refuse a plan with a position farther than this from the vehicle (default: 100000)",
-    )
+    text = "refuse a plan with a position farther than this from the vehicle"
+    add_number(command, "--max-distance-m", 1, 1e8, "M", text, default=MAX_DISTANCE_M)
 
 
 async def _start_mission(vehicle: Vehicle, _: argparse.Namespace) -> None:

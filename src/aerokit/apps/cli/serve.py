@@ -8,7 +8,7 @@ import sys
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.apps.cli.arguments import add_record, count, port
+from aerokit.apps.cli.arguments import add_record, add_repeatable, count, port
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
 from aerokit.apps.cli.output import DONE, FAILED, add_json, emit, import_extra, new_recording
 from aerokit.apps.cli.terminal import on_interrupt
@@ -48,13 +48,7 @@ def _add_web(command: argparse.ArgumentParser) -> None:
     web.add_argument("--port", type=port, default=8080, help="TCP port; 0: any free port (default: 8080)")
     web.add_argument("--token-file", metavar="FILE", help="file with the token (default: a random token at each start)")
     web.add_argument("--read-only", action="store_true", help="reject all orders")
-    web.add_argument(
-        "--allow-host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="host name that browsers may use, besides localhost and IP addresses (repeatable)",
-    )
+    add_repeatable(web, "--allow-host", "NAME", "host name that browsers may use, besides localhost and IP addresses")
     web.add_argument(
         "--metadata",
         metavar="FILE",

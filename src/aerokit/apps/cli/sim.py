@@ -13,6 +13,7 @@ import anyio
 from aerokit.apps.cli.arguments import (
     DEFAULT_SIM_ADDRESS,
     add_conditions,
+    add_number,
     add_vehicle_kind,
     address_or_template,
     conditions,
@@ -20,7 +21,6 @@ from aerokit.apps.cli.arguments import (
     expand_address,
     home,
     is_address_template,
-    number,
     picture,
     system_id,
 )
@@ -148,9 +148,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--count", type=count, default=1, metavar="N", help="number of vehicles, 1 to 250 (default: 1)"
     )
-    command.add_argument(
-        "--speedup", type=number(0.1, 100), default=1.0, metavar="X", help="simulation speed factor (default: 1)"
-    )
+    add_number(command, "--speedup", 0.1, 100, "X", "simulation speed factor", default=1.0)
     command.add_argument(
         "--system-id", type=system_id, default=1, metavar="ID", help="system id of the first vehicle (default: 1)"
     )
@@ -161,23 +159,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="LAT,LON,ALT",
         help=f"home of the first vehicle, in degrees and metres above sea level ({','.join(map(str, HOME))})",
     )
-    command.add_argument(
-        "--spacing",
-        type=number(0, 1000),
-        default=5.0,
-        metavar="M",
-        help="eastward distance between vehicles in metres (default: 5)",
-    )
+    add_number(command, "--spacing", 0, 1000, "M", "eastward distance between vehicles in metres", default=5.0)
     command.add_argument("--seed", type=int, default=0, help="random seed of the first vehicle (default: 0)")
     _add_devices(command)
     add_conditions(command)
-    command.add_argument(
-        "--boot-time", type=number(0, 600), metavar="S", help="simulated seconds until the vehicle is ready to arm"
-    )
+    add_number(command, "--boot-time", 0, 600, "S", "simulated seconds until the vehicle is ready to arm")
     add_signing_key(command, "signing key of the vehicles; ArduPilot's first port accepts unsigned messages too")
-    command.add_argument(
-        "--duration", type=number(0.1, 1e6), metavar="S", help="stop after S simulated seconds (default: at Ctrl-C)"
-    )
+    add_number(command, "--duration", 0.1, 1e6, "S", "stop after S simulated seconds (default: at Ctrl-C)")
     command.add_argument(
         "--picture",
         type=picture,

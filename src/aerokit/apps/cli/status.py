@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.apps.cli.arguments import number
+from aerokit.apps.cli.arguments import add_number
 from aerokit.apps.cli.connecting import add_link, add_seconds, await_vehicle, opened
 from aerokit.apps.cli.output import DONE, FAILED, emit
 from aerokit.apps.readiness import Readiness, active_failsafe, readiness, readiness_lines
@@ -197,13 +197,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_status)
     add_link(command)
     add_seconds(command, "listen for S seconds after the first heartbeat (default: 3)", default=3.0)
-    command.add_argument(
-        "--patience",
-        type=number(0.1, 3600),
-        default=30.0,
-        metavar="S",
-        help="fail if no vehicle is found within S seconds (default: 30)",
-    )
+    add_number(command, "--patience", 0.1, 3600, "S", "fail if no vehicle is found within S seconds", default=30.0)
 
 
 async def run_status(options: argparse.Namespace) -> int:
