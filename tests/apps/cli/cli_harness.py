@@ -13,7 +13,7 @@ import anyio
 
 from aerokit import messages as m
 from aerokit.apps.cli.main import make_parser
-from aerokit.apps.cli.output import emit_error, exit_code
+from aerokit.apps.cli.output import DONE, emit_error, exit_code
 from aerokit.errors import AerokitError
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
@@ -39,7 +39,7 @@ async def run_on(link: Link | None, *arguments: str) -> int:
     if link is not None:
         setattr(options, "address" if hasattr(options, "address") else "connect", link)
     try:
-        code: int = await options.run(options)
+        code: int = await options.run(options) or DONE
     except (AerokitError, OSError) as error:
         code = exit_code(error)
         emit_error(error, code, as_json=options.json)

@@ -10,7 +10,7 @@ import anyio
 
 from aerokit.apps.cli.arguments import add_number, add_repeatable, address, port
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, opened
-from aerokit.apps.cli.output import DONE, add_json, can_print, emit, import_extra
+from aerokit.apps.cli.output import add_json, can_print, emit, import_extra
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 from aerokit.transport.address import parse_address
@@ -112,7 +112,7 @@ def _without_password(broker: str) -> str:
     return str(parse_broker(broker, "mqtt", "mqtts"))
 
 
-async def _foxglove(options: argparse.Namespace) -> int:
+async def _foxglove(options: argparse.Namespace) -> None:
     import_extra("foxglove", extra="foxglove")
     from aerokit.apps.foxglove import foxglove_bridge
 
@@ -132,14 +132,13 @@ async def _foxglove(options: argparse.Namespace) -> int:
         ):
             _emit_serving(options, bridge)
             await _wait_until_ended(connection, stop)
-    return DONE
 
 
 def _rates(options: argparse.Namespace) -> dict[type[Message], float] | None:
     return {} if options.listen_only else None
 
 
-async def _publish(options: argparse.Namespace) -> int:
+async def _publish(options: argparse.Namespace) -> None:
     import_extra(options.required_module, extra=options.extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
@@ -167,7 +166,6 @@ async def _publish(options: argparse.Namespace) -> int:
                     publications[system_id].publish(connection.now())
                 with anyio.move_on_after(1 / options.rate):
                     await stop.wait()
-    return DONE
 
 
 async def _wait_until_ended(connection: Connection, stop: asyncio.Event) -> None:

@@ -8,7 +8,7 @@ from glob import glob
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.output import DONE, import_extra
+from aerokit.apps.cli.output import import_extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -36,9 +36,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
 
 
-async def run_completion(options: argparse.Namespace) -> int:
+async def run_completion(options: argparse.Namespace) -> None:
     print(import_extra("argcomplete", extra="completion").shellcode(["aerokit"], shell=options.shell))
-    return DONE
 
 
 def set_completions(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:

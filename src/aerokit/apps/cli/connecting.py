@@ -13,7 +13,7 @@ import anyio
 
 from aerokit.apps.cli.arguments import add_baud, add_number, add_system_id, address, number, system_id
 from aerokit.apps.cli.completion import addresses, set_completions
-from aerokit.apps.cli.output import DONE, add_json, emit, emit_done
+from aerokit.apps.cli.output import DONE, FAILED, add_json, emit
 from aerokit.apps.cli.terminal import confirm, is_interactive, on_interrupt, showing_countdown
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID, explain_no_vehicle, open_connection
 from aerokit.errors import ConnectFailed, InvalidArgument
@@ -148,7 +148,7 @@ def add_vehicle(command: argparse.ArgumentParser) -> None:
 def add_action(
     actions: argparse._SubParsersAction[argparse.ArgumentParser],
     name: str,
-    run: Callable[[argparse.Namespace], Awaitable[int]],
+    run: Callable[[argparse.Namespace], Awaitable[int | None]],
     text: str,
     *,
     connects: bool = True,
@@ -162,35 +162,30 @@ def add_action(
     return action
 
 
-async def is_declined(options: argparse.Namespace, action: str, question: str, outcome: str) -> bool:
-    """Ask the user for confirmation. Return True if the user declines, or if stdin is not a terminal.
-
-    With ``--yes``, return False without asking. ``outcome`` is the last word of the text printed after a refusal:
-    "sent" in "nothing was sent".
-    """
-    if options.yes or (is_interactive() and await confirm(question)):
-        return False
-    emit(options, "declined", {"action": action}, f"not confirmed; nothing was {outcome}")
-    return True
-
-
 def command_action(
     name: str,
     text: str,
     action: Callable[[Any, argparse.Namespace], Awaitable[object]],
     open_target: Callable[[argparse.Namespace], AbstractAsyncContextManager[Any]] | None = None,
+    *,
+    question: str = "",
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
     """Return the ``run`` function of a command that performs one action and then prints one line.
 
     The line is ``text``, or with ``--json`` a ``done`` record with ``name``. Options named in braces are replaced in
     both. ``action`` is called with a target and the options; the target is the vehicle, or what ``open_target`` yields.
+    With a ``question``, the command has the option ``--yes``, and asks the user for confirmation before it connects.
     """
 
     async def run(options: argparse.Namespace) -> int:
+        is_confirmed = not question or options.yes or (is_interactive() and await confirm(question))
+        if not is_confirmed:
+            emit(options, "declined", {"action": name}, f"not confirmed; nothing was {text}")
+            return FAILED
         opening = connected(options, changes_vehicle=True) if open_target is None else open_target(options)
         async with opening as target:
             await action(target, options)
-        emit_done(options, name.format(**vars(options)), text.format(**vars(options)))
+        emit(options, "done", {"action": name.format(**vars(options))}, text.format(**vars(options)))
         return DONE
 
     return run

@@ -10,8 +10,8 @@ from urllib.parse import unquote
 import anyio
 
 from aerokit.apps.cli.arguments import add_number, directory, integer, number
-from aerokit.apps.cli.connecting import add_action, command_action, connected, is_declined
-from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
+from aerokit.apps.cli.connecting import add_action, command_action, connected
+from aerokit.apps.cli.output import DONE, FAILED, emit
 from aerokit.errors import AerokitError
 from aerokit.position import Position
 
@@ -62,7 +62,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     zoom = add_action(actions, "zoom", zoom_to, "Zoom.")
     zoom.add_argument("percent", type=number(0, 100), metavar="PERCENT", help="of the zoom range, 0 to 100")
     streams = add_action(actions, "streams", _streams, "List the video streams with their addresses.")
-    format_storage = add_action(actions, "format", _format, "Format the storage. All pictures are deleted.")
+    run_format = command_action(
+        "camera format",
+        "formatted",
+        lambda camera, _: camera.format_storage(),
+        _camera,
+        question="format the camera's storage?",
+    )
+    format_storage = add_action(actions, "format", run_format, "Format the storage. All pictures are deleted.")
     format_storage.add_argument("--yes", action="store_true", help="do not ask")
     for action in (info, photo, video, mode, zoom, streams, format_storage):
         action.add_argument("--camera", type=int, metavar="ID", help=_ID_HELP)
@@ -76,7 +83,7 @@ async def _camera(options: argparse.Namespace, *, changes_vehicle: bool = True) 
         yield camera
 
 
-async def _info(options: argparse.Namespace) -> int:
+async def _info(options: argparse.Namespace) -> None:
     async with _camera(options, changes_vehicle=False) as camera:
         information = camera.information.value
         name = _printable_text(f"{information.vendor} {information.model}")
@@ -87,7 +94,6 @@ async def _info(options: argparse.Namespace) -> int:
         for card in await camera.load_storage():
             free = "" if card.available_mib is None else f", {card.available_mib:.0f} MiB free"
             emit(options, "card", card.to_dict(), f"card {card.number}: {card.status}{free}")
-    return DONE
 
 
 async def _photo(options: argparse.Namespace) -> int:
@@ -161,23 +167,13 @@ async def _record_video(camera: Camera, options: argparse.Namespace) -> None:
     await (camera.start_video() if options.what == "start" else camera.stop_video())
 
 
-async def _streams(options: argparse.Namespace) -> int:
+async def _streams(options: argparse.Namespace) -> None:
     async with _camera(options) as camera:
         for stream in await camera.load_streams():
             size = f"{stream.width_px}x{stream.height_px}"
             name = _printable_text(stream.name)
             text = f"{stream.number:>3}  {_printable_text(stream.uri)}  {size}  {stream.encoding}  {name}".rstrip()
             emit(options, "stream", stream.to_dict(), text)
-    return DONE
-
-
-async def _format(options: argparse.Namespace) -> int:
-    if await is_declined(options, "camera format", "format the camera's storage?", "formatted"):
-        return FAILED
-    async with _camera(options) as camera:
-        await camera.format_storage()
-    emit_done(options, "camera format", "formatted")
-    return DONE
 
 
 def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
@@ -222,7 +218,7 @@ async def _gimbal(options: argparse.Namespace, *, changes_vehicle: bool = True) 
         yield vehicle.gimbal if options.gimbal is None else vehicle.gimbals.get(options.gimbal)
 
 
-async def _gimbal_info(options: argparse.Namespace) -> int:
+async def _gimbal_info(options: argparse.Namespace) -> None:
     async with _gimbal(options, changes_vehicle=False) as gimbal:
         try:
             information = await gimbal.information()
@@ -236,7 +232,6 @@ async def _gimbal_info(options: argparse.Namespace) -> int:
             text = ", ".join(f"{name} {angle:.0f}" for name, angle in angles.items() if angle is not None)
             record = {f"{name}_deg": angle for name, angle in angles.items()}
             emit(options, "gimbal_attitude", record, f"attitude: {text}")
-    return DONE
 
 
 async def _point(gimbal: Gimbal, options: argparse.Namespace) -> None:

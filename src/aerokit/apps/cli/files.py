@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import directory
-from aerokit.apps.cli.connecting import add_action, command_action, connected, is_declined
-from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, emit_done
+from aerokit.apps.cli.connecting import add_action, command_action, connected
+from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.connection.frame_observers import keep_existing
 from aerokit.errors import InvalidArgument
@@ -62,16 +62,15 @@ def _size(path: str | os.PathLike[str]) -> int:
     return os.path.getsize(path)
 
 
-async def _list(options: argparse.Namespace) -> int:
+async def _list(options: argparse.Namespace) -> None:
     async with connected(options) as vehicle:
         for entry in await vehicle.files.list(options.path, idle_timeout_s=options.patience):
             size = "" if entry.size is None else f"{entry.size}"
             text = f"{size:>12}  {entry.name}{'/' if entry.is_directory else ''}"
             emit(options, "file", {"directory": options.path, **entry.to_dict()}, text)
-    return DONE
 
 
-async def _get(options: argparse.Namespace) -> int:
+async def _get(options: argparse.Namespace) -> None:
     target = _destination(options)
     check_not_existing(target, options)
     async with connected(options) as vehicle:
@@ -81,7 +80,6 @@ async def _get(options: argparse.Namespace) -> int:
             )
     size = _size(target)
     emit(options, "fetched", {"path": options.path, "file": target, "bytes": size}, f"{target}: {size} bytes")
-    return DONE
 
 
 def _destination(options: argparse.Namespace) -> Path:
@@ -90,7 +88,7 @@ def _destination(options: argparse.Namespace) -> Path:
     return target / name if target.is_dir() else target
 
 
-async def _put(options: argparse.Namespace) -> int:
+async def _put(options: argparse.Namespace) -> None:
     size = _size(options.file)
     async with connected(options, changes_vehicle=True) as vehicle:
         with progress_bar(Path(options.file).name, unit="B") as on_progress:
@@ -99,14 +97,12 @@ async def _put(options: argparse.Namespace) -> int:
             )
     record = {"file": options.file, "path": options.path, "bytes": size}
     emit(options, "sent", record, f"{options.path}: {size} bytes")
-    return DONE
 
 
-async def _crc(options: argparse.Namespace) -> int:
+async def _crc(options: argparse.Namespace) -> None:
     async with connected(options) as vehicle:
         crc = f"{await vehicle.files.crc32(options.path, idle_timeout_s=options.patience):08x}"
     emit(options, "crc", {"path": options.path, "crc32": crc}, crc)
-    return DONE
 
 
 def add_logs_arguments(command: argparse.ArgumentParser) -> None:
@@ -123,16 +119,21 @@ def add_logs_arguments(command: argparse.ArgumentParser) -> None:
         help="directory to write them to, which is created if needed (default: this directory)",
     )
     get.add_argument("--method", choices=("auto", "ftp", "log"), default="auto", help="download method (default: auto)")
-    erase = add_action(actions, "erase", _erase, "Erase all flight logs.")
+    run_erase = command_action(
+        "logs erase",
+        "erased",
+        lambda vehicle, options: vehicle.logs.erase(idle_timeout_s=options.patience),
+        question="erase all flight logs of the vehicle?",
+    )
+    erase = add_action(actions, "erase", run_erase, "Erase all flight logs.")
     erase.add_argument("--yes", action="store_true", help="do not ask")
 
 
-async def _list_logs(options: argparse.Namespace) -> int:
+async def _list_logs(options: argparse.Namespace) -> None:
     async with connected(options) as vehicle:
         for entry in await vehicle.logs.list(idle_timeout_s=options.patience):
             time = "" if entry.time_utc is None else f"{entry.time_utc:%Y-%m-%d %H:%M:%S}"
             emit(options, "log", entry.to_dict(), f"{entry.id:>6}  {entry.size:>12}  {time}".rstrip())
-    return DONE
 
 
 async def _get_logs(options: argparse.Namespace) -> int:
@@ -165,12 +166,3 @@ def _selected_logs(entries: Sequence[LogEntry], options: argparse.Namespace) -> 
         if log_id not in by_id:
             raise InvalidArgument(f"the vehicle has no log {log_id}; its logs: {', '.join(map(str, by_id)) or 'none'}")
     return [by_id[log_id] for log_id in options.ids]
-
-
-async def _erase(options: argparse.Namespace) -> int:
-    if await is_declined(options, "logs erase", "erase all flight logs of the vehicle?", "erased"):
-        return FAILED
-    async with connected(options, changes_vehicle=True) as vehicle:
-        await vehicle.logs.erase(idle_timeout_s=options.patience)
-    emit_done(options, "logs erase", "erased")
-    return DONE

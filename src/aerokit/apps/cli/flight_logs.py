@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit._internal.formatting import printable
-from aerokit.apps.cli.output import DONE, add_force, add_json, check_not_existing, emit, import_extra
+from aerokit.apps.cli.output import add_force, add_json, check_not_existing, emit, import_extra
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.logs.flights import check_log_name
 from aerokit.logs.report.formatting import clock_text
@@ -41,7 +41,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_json(command)
 
 
-async def _convert(options: argparse.Namespace) -> int:
+async def _convert(options: argparse.Namespace) -> None:
     # Without a suffix, OUT is a folder of tables.
     suffix = options.out.suffix.lower() or f".{options.tables}"
     module = _REQUIRED_MODULES.get(suffix)
@@ -65,7 +65,6 @@ async def _convert(options: argparse.Namespace) -> int:
         f" {_size(result.bytes)}, {_utc_text(result.begins_at)} to {_utc_text(result.ends_at)} UTC"
     )
     emit(options, "conversion", {**result.to_dict(), "log": options.log}, text)
-    return DONE
 
 
 def _counted_noun(count: int, singular: str) -> str:
@@ -96,7 +95,7 @@ def add_report_arguments(command: argparse.ArgumentParser) -> None:
     add_json(command)
 
 
-async def _report(options: argparse.Namespace) -> int:
+async def _report(options: argparse.Namespace) -> None:
     import_extra("plotly", extra="report")
     logs = [options.log] if options.other is None else [options.log, options.other]
     if any(log.suffix.lower() == ".ulg" for log in logs):
@@ -122,7 +121,6 @@ async def _report(options: argparse.Namespace) -> int:
         import webbrowser
 
         webbrowser.open(report.target.resolve().as_uri())
-    return DONE
 
 
 def _report_text(report: Report) -> str:

@@ -42,8 +42,8 @@ class CliCommand:
 
     ``location`` names a function in `aerokit.apps.cli`: ``"module:function"``, or ``"module"`` for its function
     ``add_arguments``. The function adds the command's arguments to a parser. It also sets ``run``: a coroutine function
-    that takes the parsed options and returns the exit code. The first sentence of ``description`` appears in the list
-    of commands.
+    that takes the parsed options and returns the exit code, or None for DONE. The first sentence of ``description``
+    appears in the list of commands.
     """
 
     name: str
@@ -250,7 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser(arguments[0]).parse_args(arguments)
     try:
         with plain_warnings(), nonblocking_stderr():
-            code: int = asyncio.run(options.run(options))
+            code: int | None = asyncio.run(options.run(options))
     except BrokenPipeError:
         # At exit, the interpreter flushes stdout. With the old stdout, it would report another BrokenPipeError.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
@@ -259,7 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report_error(KeyboardInterrupt("interrupted"), options)
     except (AerokitError, OSError) as error:
         return _report_error(error, options)
-    return code
+    return DONE if code is None else code
 
 
 def _installation_problem() -> str | None:

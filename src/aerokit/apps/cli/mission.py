@@ -11,7 +11,7 @@ from aerokit._internal.files import read_text
 from aerokit.apps.cli.arguments import add_number, writable_file
 from aerokit.apps.cli.completion import set_completions
 from aerokit.apps.cli.connecting import add_action, command_action, connected
-from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, suggestion
+from aerokit.apps.cli.output import add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.terminal import progress_bar
 from aerokit.apps.plan_text import parse_plan_text
 from aerokit.errors import InvalidArgument, OperationRejected
@@ -201,15 +201,14 @@ def _part(text: str) -> str:
     return text
 
 
-async def _show(options: argparse.Namespace) -> int:
+async def _show(options: argparse.Namespace) -> None:
     async with connected(options) as vehicle:
         for part in options.parts:
             items = (await _download_part(vehicle, part, options)).to_items()
             emit_items(options, part, items, state="on the vehicle")
-    return DONE
 
 
-async def _download(options: argparse.Namespace) -> int:
+async def _download(options: argparse.Namespace) -> None:
     from aerokit.missions import Plan, write_plan_file, write_waypoint_file
 
     check_not_existing(options.file, options)
@@ -224,20 +223,18 @@ async def _download(options: argparse.Namespace) -> int:
             write_waypoint_file(options.file, mission)
     record = {"file": options.file, "what": "mission items", "count": len(mission)}
     emit(options, "saved", record, f"{len(mission)} mission items written to {options.file}")
-    return DONE
 
 
-async def _upload(options: argparse.Namespace) -> int:
+async def _upload(options: argparse.Namespace) -> None:
     plan = read_plan(options.file)
     if not any(getattr(plan, part).to_items() for part in PARTS):
         raise InvalidArgument(f"{options.file} has no items; nothing was uploaded")
     _emit_warnings(plan, options)
     async with connected(options, changes_vehicle=True) as vehicle:
         await upload_parts(vehicle, plan, options)
-    return DONE
 
 
-async def _check(options: argparse.Namespace) -> int:
+async def _check(options: argparse.Namespace) -> None:
     plan = read_plan(options.file)
     has_items = False
     for part in PARTS:
@@ -253,7 +250,6 @@ async def _check(options: argparse.Namespace) -> int:
     if not options.json:
         warning_count = f", but {len(warnings)} warning{'' if len(warnings) == 1 else 's'}" if warnings else ""
         print(f"{options.file} has no errors{warning_count}")
-    return DONE
 
 
 def _emit_warnings(plan: Plan, options: argparse.Namespace) -> list[str]:
@@ -274,12 +270,11 @@ def _notes(plan: Plan) -> list[str]:
     return []
 
 
-async def _clear(options: argparse.Namespace) -> int:
+async def _clear(options: argparse.Namespace) -> None:
     async with connected(options, changes_vehicle=True) as vehicle:
         for part in options.parts:
             await getattr(vehicle, part).clear(idle_timeout_s=options.patience)
             emit_part(options, part, items=0, state="cleared", text=f"{part}: cleared")
-    return DONE
 
 
 async def _download_part(vehicle: Vehicle, part: str, options: argparse.Namespace) -> Any:

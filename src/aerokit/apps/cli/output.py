@@ -120,10 +120,6 @@ def _print(text: str) -> None:
         print(text.encode("ascii", "replace").decode(), flush=True)
 
 
-def emit_done(options: argparse.Namespace, action: str, text: str) -> None:
-    emit(options, "done", {"action": action}, text)
-
-
 def emit_error(error: BaseException, code: int, *, as_json: bool) -> None:
     text = _text(error)
     if as_json:

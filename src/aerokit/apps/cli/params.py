@@ -129,15 +129,14 @@ def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle)
         raise ValueUnknownError(defaults_unknown_text(vehicle)) from None
 
 
-async def _get(options: argparse.Namespace) -> int:
+async def _get(options: argparse.Namespace) -> None:
     metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         for name in options.names:
             _emit_parameters(options, [await _read(vehicle, name, options)], metadata)
-    return DONE
 
 
-async def _save(options: argparse.Namespace) -> int:
+async def _save(options: argparse.Namespace) -> None:
     from aerokit.parameters import write_parameter_file
 
     check_not_existing(options.file, options)
@@ -146,7 +145,6 @@ async def _save(options: argparse.Namespace) -> int:
     write_parameter_file(options.file, table, format=options.format)
     record = {"file": options.file, "what": "parameters", "count": len(table)}
     emit(options, "saved", record, f"{len(table)} parameters written to {options.file}")
-    return DONE
 
 
 async def _diff(options: argparse.Namespace) -> int:

@@ -25,7 +25,7 @@ from aerokit.apps.cli.arguments import (
     system_id,
 )
 from aerokit.apps.cli.connecting import add_signing_key
-from aerokit.apps.cli.output import DONE, add_json, emit
+from aerokit.apps.cli.output import add_json, emit
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavComponent, MavType
@@ -216,7 +216,7 @@ def _devices(options: argparse.Namespace) -> list[AttachableComponent]:
     return components
 
 
-async def run_sim(options: argparse.Namespace) -> int:
+async def run_sim(options: argparse.Namespace) -> None:
     vehicles = _fleet(options)
     scale_timeouts(vehicles, options.speedup, leave=dict(options.parameters))
     tracks = _tracks(vehicles, options.picture)
@@ -235,7 +235,6 @@ async def run_sim(options: argparse.Namespace) -> int:
         save_picture(tracks, options.picture)
         record = {"file": options.picture, "what": "track", "count": len(tracks)}
         emit(options, "saved", record, f"track written to {options.picture}")
-    return DONE
 
 
 @asynccontextmanager
