@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavFrame, MavResult
@@ -85,8 +85,7 @@ class CommandRequest:
 
     def report_progress(self, percent: int) -> None:
         """Send IN_PROGRESS with this percentage (0 to 100) now, and repeat it until the next report."""
-        if not 0 <= percent <= 100:
-            raise InvalidArgument(f"percent = {percent} is not allowed: it must be 0 to 100")
+        check_range("percent", percent, 0, 100)
         self._report(percent)
 
     def __repr__(self) -> str:
@@ -364,8 +363,7 @@ class ComponentServices:
 
         Raises InvalidArgument if the rate is not 0 to 200 Hz, or the message already has a function.
         """
-        if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
-            raise InvalidArgument(f"hz = {hz} is not allowed: it must be 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")
+        check_range("hz", hz, 0.0, 1.0 / MIN_STREAM_INTERVAL_S)
         if message_type.ID in self.streams.builders:
             raise InvalidArgument(f"{message_type.NAME} already has a function")
 

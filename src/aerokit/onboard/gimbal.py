@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit._internal.arguments import check_range
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
@@ -78,8 +79,7 @@ class GimbalDriver:
                 )
         if not max_rate_deg_s > 0:
             raise InvalidArgument(f"max_rate_deg_s = {max_rate_deg_s} is not allowed: it must be above 0")
-        if not 0 <= attitude_hz <= 100:
-            raise InvalidArgument(f"attitude_hz = {attitude_hz} is not allowed: it must be 0 to 100")
+        check_range("attitude_hz", attitude_hz, 0, 100)
         self.vendor: str = vendor
         self.model: str = model
         self.limits_deg: tuple[tuple[float, float], ...] = (roll_deg, pitch_deg, yaw_deg)

@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit._internal.arguments import checked
+from aerokit._internal.arguments import check_range, checked
 from aerokit._internal.async_block import async_block
 from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, InvalidArgument
@@ -142,8 +142,7 @@ async def component(
 
 def _heartbeat(type_: int, autopilot: int) -> Heartbeat:
     for name, value in (("type", type_), ("autopilot", autopilot)):
-        if not 0 <= value <= 255:
-            raise InvalidArgument(f"{name} = {value} is not allowed: it must be 0 to 255")
+        check_range(name, value, 0, 255)
     return Heartbeat(
         type_, autopilot, base_mode=0, custom_mode=0, system_status=MavState.ACTIVE, mavlink_version=MAVLINK_VERSION
     )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import AdsbAltitudeType, AdsbFlags, LandingTargetType, MavFrame
@@ -62,8 +62,7 @@ class ComponentSources:
             raise InvalidArgument(
                 f"min_m, max_m = {min_m}, {max_m} are not allowed: both must be 0 to 655, and min_m below max_m"
             )
-        if not 0 < increment_deg <= 360:
-            raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: it must be above 0 and at most 360")
+        check_range("increment_deg", increment_deg, 0, 360, above=True)
         nothing_in_range = round(max_m * 100) + 1  # In OBSTACLE_DISTANCE, max_distance + 1 means no obstacle.
         values = [_centimetres(distance, nothing_in_range) for distance in distances_m]
         values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))
@@ -159,9 +158,8 @@ class ComponentSources:
             InvalidArgument: a value is out of range.
             ConnectionClosed, LinkLost: the connection has ended.
         """
-        for name, angle in (("right_deg", right_deg), ("down_deg", down_deg)):
-            if not -90 <= angle <= 90:
-                raise InvalidArgument(f"{name} = {angle} is not allowed: it must be -90 to 90")
+        check_range("right_deg", right_deg, -90, 90)
+        check_range("down_deg", down_deg, -90, 90)
         if not 0 <= distance_m < math.inf:
             raise InvalidArgument(f"distance_m = {distance_m} is not allowed: it must be 0 or more")
         self._send(

@@ -73,11 +73,11 @@ def test_fly_sim_starts_at_planned_home(capsys: pytest.CaptureFixture[str]) -> N
 def test_fly_sim_starts_at_sea_level_if_planned(monkeypatch: pytest.MonkeyPatch) -> None:
     started = []
 
-    def simulated_vehicle(kind: str, home: tuple[float, float, float], **options: object) -> None:
+    def simulated(kind: str, home: tuple[float, float, float], **options: object) -> None:
         started.append(home)
         raise InvalidArgument("end of this test")
 
-    monkeypatch.setattr("aerokit.apps.cli.sim.simulated_vehicle", simulated_vehicle)
+    monkeypatch.setattr("aerokit.sim.kinds.simulated", simulated)
     Path("m.waypoints").write_text(MISSION.replace("\t488\t", "\t0\t"))
     assert run_virtual(run_on(None, "fly", "m.waypoints", "--sim")) == 2
     assert started == [(47.397742, 8.545594, 0.0)]

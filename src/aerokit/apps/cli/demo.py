@@ -9,7 +9,7 @@ from aerokit.apps.cli.arguments import add_faults, add_number, add_system_id, ad
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, connect_to, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
-from aerokit.apps.cli.sim import injecting_faults, simulated_vehicle
+from aerokit.apps.cli.sim import injecting_faults
 from aerokit.apps.cli.supervised_flight import FlightReport, SupervisedFlight
 from aerokit.apps.cli.terminal import InterruptStack, on_interrupt
 from aerokit.errors import AerokitError, InvalidArgument, NotSupported, OperationRejected
@@ -88,9 +88,9 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
         yield options.connect
         return
     from aerokit.sim import open_simulator
-    from aerokit.sim.kinds import scale_timeouts
+    from aerokit.sim.kinds import scale_timeouts, simulated
 
-    vehicle = simulated_vehicle(options.vehicle)
+    vehicle = simulated(options.vehicle)
     scale_timeouts([vehicle], options.speedup)
     async with open_simulator(vehicle, "tcpin:127.0.0.1:0", speedup=options.speedup) as simulator:
         address = simulator.addresses[0].replace("tcpin", "tcp")

@@ -285,9 +285,9 @@ async def _connect_and_fly(
 
 
 async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: AsyncExitStack) -> Link:
-    from aerokit.apps.cli.sim import injecting_faults, simulated_vehicle
+    from aerokit.apps.cli.sim import injecting_faults
     from aerokit.sim import simulated_link
-    from aerokit.sim.kinds import scale_timeouts
+    from aerokit.sim.kinds import scale_timeouts, simulated
     from aerokit.sim.motion import HOME
 
     kind = options.vehicle or _kind_for(plan)
@@ -299,7 +299,7 @@ async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: Asyn
         if start.altitude_amsl_m is not None:
             altitude_m = start.altitude_amsl_m
     home = (latitude_deg, longitude_deg, altitude_m)
-    vehicle = simulated_vehicle(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S, **conditions(options))
+    vehicle = simulated(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S, **conditions(options))
     scale_timeouts([vehicle], options.speedup, leave=dict(options.parameters))
     link = await stack.enter_async_context(simulated_link(vehicle, speedup=options.speedup))
     await stack.enter_async_context(injecting_faults([vehicle], options))

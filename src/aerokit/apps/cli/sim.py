@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 import shlex
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,7 +29,7 @@ from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavComponent, MavType
 from aerokit.sim import ExtraComponent, SimulatedCamera, SimulatedGimbal, SimulatedVehicle, SimulatorServer
-from aerokit.sim.kinds import kind_class, scale_timeouts, simulated
+from aerokit.sim.kinds import scale_timeouts, simulated
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 from aerokit.transport import create_link
 from aerokit.transport.address import parse_address
@@ -55,21 +54,6 @@ _CLIENT_SCHEMES = {
 _SERIAL_LINE_PLACEHOLDER = "the other end of the serial line"
 
 
-def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
-    """Create a vehicle of a kind of `aerokit.sim.kinds`.
-
-    Kinds without the option ``boot_text`` ignore it. Raises InvalidArgument if the kind, another option or a parameter
-    is unknown.
-    """
-    accepted = _accepted_options(kind_class(name))
-    if "boot_text" not in accepted:
-        options.pop("boot_text", None)
-    for option in options:
-        if option not in accepted:
-            raise InvalidArgument(f"the simulated {name} has no option {option}")
-    return simulated(name, **options)
-
-
 def simulated_fleet(
     name: str,
     count: int,
@@ -88,6 +72,8 @@ def simulated_fleet(
     """
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
+    if name.startswith("px4"):
+        options.pop("boot_text", None)  # PX4 sends no text at boot.
     last_id = system_id + count - 1
     if last_id > 255:
         raise InvalidArgument(
@@ -97,7 +83,7 @@ def simulated_fleet(
     frame = LocalFrame(GlobalPoint(round(latitude_deg * 1e7), round(longitude_deg * 1e7), altitude_m))
     homes = [frame.to_global(north=0.0, east=number * spacing_m, down=0.0) for number in range(count)]
     return [
-        simulated_vehicle(
+        simulated(
             name,
             home=(vehicle_home.latitude_e7 / 1e7, vehicle_home.longitude_e7 / 1e7, altitude_m),
             system_id=system_id + number,
@@ -115,19 +101,6 @@ def _recorded(path: str, count: int) -> SimulatedVehicle:
     if count != 1:
         raise InvalidArgument(f"count = {count} is not allowed: the recording {path} has only one vehicle")
     return RecordedVehicle(path)
-
-
-def _accepted_options(vehicle_class: type) -> set[str]:
-    """Return the names of a class's constructor arguments, including those that it passes on to base classes."""
-    names: set[str] = set()
-    for cls in vehicle_class.__mro__:
-        if "__init__" not in vars(cls):
-            continue
-        parameters = inspect.signature(vars(cls)["__init__"]).parameters.values()
-        names |= {parameter.name for parameter in parameters}
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-            break
-    return names
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit._internal.arguments import checked
+from aerokit._internal.arguments import check_range, checked
 from aerokit._internal.async_block import async_block
 from aerokit._internal.formatting import to_jsonable
 from aerokit.apps.network.mqtt_publisher import mqtt_publisher
@@ -136,8 +136,7 @@ async def publishing(
         LinkOpenError: the network or broker cannot be reached, or the required package is not installed.
         ConnectionClosed, LinkLost: the vehicle's connection has ended.
     """
-    if not 0 < rate_hz <= MAX_RATE_HZ:
-        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: it must be above 0 and at most {MAX_RATE_HZ:g}")
+    check_range("rate_hz", rate_hz, 0, MAX_RATE_HZ, above=True)
     state_names = frozenset(states)
     unknown = sorted(state_names - vehicle.telemetry.cells.keys() - {"link"})
     if unknown:
