@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from aerokit.protocols.request_window import LOSS_THRESHOLD
+from aerokit.protocols.request_window import LOSS_THRESHOLD, PendingRequests, PendingRequest
 
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
@@ -74,42 +74,23 @@ class CongestionWindow:
             self._average_loss = 0.5  # Below the limit, so that only further losses halve the size again.
 
 
-class _BlockRequest:
-    """The request for one block."""
-
-    __slots__ = ("attempts", "previous_sent_at", "sent_at", "transmission_number")
-
-    def __init__(self) -> None:
-        self.attempts = 0
-        self.transmission_number = 0  # of the latest transmission, counted over all blocks
-        self.previous_sent_at = 0.0
-        self.sent_at = 0.0
-
-
-class BlockRequests:
-    """Requests for blocks, keyed by offset. An adaptive window limits the number of requests in flight.
+class BlockRequests(PendingRequests[int]):
+    """Requests for blocks, whose keys are their offsets. An adaptive window limits the number of requests in flight.
 
     Requests are sent without delay if fewer than ``batch_size`` are in flight, otherwise ``spacing_s`` seconds apart. A
     request is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, batch_size: int = BATCH_SIZE, spacing_s: float = SPACING_S) -> None:
+        super().__init__()
         self.window: CongestionWindow = CongestionWindow()
         self._round_trip = round_trip
         self._batch_size = batch_size
         self._spacing_s = spacing_s
-        # The keys of these dictionaries are offsets.
-        self._waiting: dict[int, None] = {}  # blocks to request, in order
-        self._in_flight: dict[int, _BlockRequest] = {}  # in the order in which they were sent
-        self._sent_blocks: dict[int, _BlockRequest] = {}  # blocks in flight, or waiting to be requested again
-        self._sent_count = 0
         self._timeouts = 0  # number of timeouts since the last answer
         self._busy_until = float("-inf")  # The server sends a burst until this time.
         self._next_send_at = float("-inf")  # earliest time to send while `batch_size` or more requests are in flight
         self._must_wait_to_send = False  # True if a request waits only for `_next_send_at`
-
-    def __len__(self) -> int:
-        return len(self._waiting) + len(self._in_flight)
 
     @property
     def deadline(self) -> float | None:
@@ -118,15 +99,6 @@ class BlockRequests:
         if self._must_wait_to_send and overdue_at is not None:
             return min(overdue_at, self._next_send_at)
         return overdue_at
-
-    def request(self, offset: int) -> None:
-        if offset not in self._in_flight:
-            self._waiting[offset] = None
-
-    def discard(self, offset: int) -> None:
-        self._waiting.pop(offset, None)
-        self._in_flight.pop(offset, None)
-        self._sent_blocks.pop(offset, None)
 
     def discard_from(self, end: int) -> None:
         for offset in [offset for offset in (*self._waiting, *self._in_flight) if offset >= end]:
@@ -138,7 +110,7 @@ class BlockRequests:
 
     def on_answer(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
         """Record an answer. ``sent_at`` is the time of the transmission that it answers, if known."""
-        block = self._sent_blocks.get(offset)
+        block = self._requests.get(offset)
         self.discard(offset)
         if block is None:
             return
@@ -153,9 +125,9 @@ class BlockRequests:
         self._round_trip.add_sample(now - sent_at)
         self.window.on_answer(now - sent_at)
         if block.attempts == 1:
-            self._requeue_lost(answered_transmission=block.transmission_number)
+            self._requeue_lost(answered_transmission=block.last_number)
 
-    def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
+    def _sent_at_of_answer(self, block: PendingRequest, now: float) -> float | None:
         """Return when the answered transmission was sent, or None if it is unknown which one was answered."""
         if block.attempts == 1:
             return block.sent_at
@@ -182,40 +154,26 @@ class BlockRequests:
                     self._must_wait_to_send = True
                     break
                 self._next_send_at = now + self._spacing_s
-            offset = next(iter(self._waiting))
-            del self._waiting[offset]
-            self._record_transmission(offset, now)
-            due.append(offset)
+            due.append(self._take_waiting(now))
         return due
 
-    def _due_at(self, block: _BlockRequest) -> float:
+    def _due_at(self, block: PendingRequest) -> float:
         backoff_attempt = max(1, self._timeouts - TIMEOUTS_BEFORE_BACKOFF)
         return max(block.sent_at, self._busy_until) + self._round_trip.timeout_s(backoff_attempt)
-
-    def _record_transmission(self, offset: int, now: float) -> None:
-        self._sent_count += 1
-        block = self._sent_blocks.setdefault(offset, _BlockRequest())
-        block.attempts += 1
-        block.transmission_number = self._sent_count
-        block.previous_sent_at = block.sent_at
-        block.sent_at = now
-        self._in_flight[offset] = block
 
     def _requeue_lost(self, *, answered_transmission: int) -> None:
         # Answers arrive in the order of the requests, so requests that were sent well before the answered one are lost.
         lost = []
         for offset, block in self._in_flight.items():
-            if block.transmission_number > answered_transmission - LOSS_THRESHOLD:
+            if block.last_number > answered_transmission - LOSS_THRESHOLD:
                 break  # All further blocks were requested later.
             lost.append(offset)
         self._requeue(lost)
 
     def _requeue(self, offsets: list[int]) -> None:
-        for offset in offsets:
-            del self._in_flight[offset]
+        for _ in offsets:
             self.window.on_loss()
-        if offsets:
-            self._waiting = {**dict.fromkeys(offsets), **self._waiting}
+        super()._requeue(offsets)
 
 
 WriteBytes = Callable[[bytes], object]

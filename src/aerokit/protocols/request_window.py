@@ -30,14 +30,18 @@ MAX_TIMEOUT_S = 2.0
 LOSS_THRESHOLD = 3
 
 
-class _Request:
-    """Times and numbers of a request's first and latest transmission. All requests share one count of transmissions."""
+class PendingRequest:
+    """Times and numbers of a request's transmissions. All requests share one count of transmissions."""
 
-    __slots__ = ("attempts", "due_at", "first_at", "first_number", "last_number", "sent_at", "was_duplicated")
+    __slots__ = (
+        "attempts", "due_at", "first_at", "first_number", "last_number", "previous_sent_at", "sent_at",
+        "was_duplicated",
+    )  # fmt: skip
 
     def __init__(self, now: float, number: int) -> None:
         self.first_at = now
         self.sent_at = now
+        self.previous_sent_at = now
         self.due_at = now
         self.first_number = number
         self.last_number = number
@@ -45,7 +49,54 @@ class _Request:
         self.attempts = 0
 
 
-class RequestWindow(Generic[KeyT]):
+class PendingRequests(Generic[KeyT]):
+    """Requests without an answer, each identified by a key. They wait to be sent, or are in flight."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[KeyT, None] = {}  # requests to send, in order
+        self._in_flight: dict[KeyT, PendingRequest] = {}  # in the order in which they were sent
+        self._requests: dict[KeyT, PendingRequest] = {}  # requests in flight, or waiting to be sent again
+        self._sent_count = 0
+
+    def __len__(self) -> int:
+        return len(self._waiting) + len(self._in_flight)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._waiting or key in self._in_flight
+
+    def request(self, key: KeyT) -> None:
+        if key not in self:
+            self._waiting[key] = None
+
+    def discard(self, key: KeyT) -> None:
+        self._waiting.pop(key, None)
+        self._in_flight.pop(key, None)
+        self._requests.pop(key, None)
+
+    def _take_waiting(self, now: float) -> KeyT:
+        """Count the first waiting request as sent, and return its key."""
+        key = next(iter(self._waiting))
+        del self._waiting[key]
+        self._record_transmission(key, now)
+        return key
+
+    def _record_transmission(self, key: KeyT, now: float) -> PendingRequest:
+        self._sent_count += 1
+        request = self._requests.setdefault(key, PendingRequest(now, self._sent_count))
+        request.attempts += 1
+        request.last_number = self._sent_count
+        request.previous_sent_at, request.sent_at = request.sent_at, now
+        self._in_flight[key] = request
+        return request
+
+    def _requeue(self, keys: list[KeyT]) -> None:
+        if keys:
+            for key in keys:
+                del self._in_flight[key]
+            self._waiting = {**dict.fromkeys(keys), **self._waiting}
+
+
+class RequestWindow(PendingRequests[KeyT]):
     """Requests, each identified by a key, with a limit on the number in flight.
 
     The limit is ``size`` at first, and grows to ``max_size`` while answers do not become slower. A request is repeated
@@ -61,6 +112,7 @@ class RequestWindow(Generic[KeyT]):
         max_size: int | None = None,
         duplicate_last: bool = True,
     ) -> None:
+        super().__init__()
         self._round_trip = round_trip
         self._initial_size = size
         self._max_size = MAX_GROWTH * size if max_size is None else max_size
@@ -70,18 +122,8 @@ class RequestWindow(Generic[KeyT]):
         self._answered_at = -math.inf
         self._timeouts = 0  # number of consecutive time-outs without any answer
         self._next_timeout_at = -math.inf  # earliest time to increase `_timeouts`
-        self._waiting: dict[KeyT, None] = {}  # requests to send, in order
-        self._in_flight: dict[KeyT, _Request] = {}  # in the order in which they were sent
-        self._requests: dict[KeyT, _Request] = {}  # requests in flight, or waiting to be sent again
         # By key of a repeated request: seconds from its first transmission to its answer. See `_on_duplicate_answer`.
         self._ambiguous: dict[KeyT, float] = {}
-        self._sent_count = 0
-
-    def __len__(self) -> int:
-        return len(self._waiting) + len(self._in_flight)
-
-    def __contains__(self, key: object) -> bool:
-        return key in self._waiting or key in self._in_flight
 
     @property
     def deadline(self) -> float | None:
@@ -96,19 +138,10 @@ class RequestWindow(Generic[KeyT]):
     def overdue(self, now: float) -> list[KeyT]:
         return [key for key, request in self._in_flight.items() if request.due_at <= now]
 
-    def request(self, key: KeyT) -> None:
-        if key not in self:
-            self._waiting[key] = None
-
     def record_sent(self, key: KeyT, now: float) -> None:
         """Record a request that was sent although the window may be full."""
         self._waiting.pop(key, None)
         self._record_transmission(key, now)
-
-    def discard(self, key: KeyT) -> None:
-        self._waiting.pop(key, None)
-        self._in_flight.pop(key, None)
-        self._requests.pop(key, None)
 
     def on_answer(self, key: KeyT, now: float, *, loss_threshold: int = LOSS_THRESHOLD) -> list[KeyT]:
         """Record an answer. Requeue the requests that are presumed lost, and return them.
@@ -150,10 +183,7 @@ class RequestWindow(Generic[KeyT]):
         self._requeue(overdue)
         due: list[KeyT] = []
         while self._waiting and len(self._in_flight) < self._max_in_flight:
-            key = next(iter(self._waiting))
-            del self._waiting[key]
-            self._record_transmission(key, now)
-            due.append(key)
+            due.append(self._take_waiting(now))
         if self._duplicate_last and len(self._in_flight) <= FEW_LEFT and not self._waiting:
             duplicates = [key for key in due if self._requests[key].attempts >= DUPLICATE_FROM_ATTEMPT]
             for key in duplicates:
@@ -185,23 +215,11 @@ class RequestWindow(Generic[KeyT]):
         else:
             self._max_in_flight = max(self._max_in_flight - 1, self._initial_size)
 
-    def _record_transmission(self, key: KeyT, now: float) -> None:
-        self._sent_count += 1
-        request = self._requests.get(key)
-        if request is None:
-            request = _Request(now, self._sent_count)
-            self._requests[key] = request
-        request.attempts += 1
-        request.last_number = self._sent_count
-        request.sent_at = now
-        request.due_at = now + self._timeout_s(request.attempts)
-        self._in_flight[key] = request
-
-    def _requeue(self, keys: list[KeyT]) -> None:
-        if keys:
-            for key in keys:
-                del self._in_flight[key]
-            self._waiting = {**dict.fromkeys(keys), **self._waiting}
+    def _record_transmission(self, key: KeyT, now: float) -> PendingRequest:
+        due_at = now + self._timeout_s(self.attempts(key) + 1)  # The time-out depends on the other requests.
+        request = super()._record_transmission(key, now)
+        request.due_at = due_at
+        return request
 
     def _on_duplicate_answer(self, key: KeyT) -> None:
         # Two answers mean a spurious retransmission: nothing was lost. The first answer therefore belongs to the first
