@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from aerokit.protocols.request_window import LOSS_THRESHOLD, PendingRequests, PendingRequest
+from aerokit.protocols.request_window import LOSS_THRESHOLD, PendingRequest, PendingRequests
 
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
