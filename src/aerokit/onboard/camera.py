@@ -31,7 +31,6 @@ from aerokit.protocols.servers.camera_device import UNKNOWN_ATTITUDE, CameraDevi
 from aerokit.protocols.servers.parameters import DefinedParameterServer
 
 if TYPE_CHECKING:
-    from aerokit.connection.tasks import BackgroundTasks
     from aerokit.onboard.commands import ComponentServices
     from aerokit.onboard.host import ComponentHost
     from aerokit.parameters import CameraDefinition, SettingValue
@@ -210,9 +209,7 @@ _AUTO_FOCUS_TYPES = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.A
 class CameraAdapter(CameraDevice):
     """Serves the camera protocol for a `CameraDriver`."""
 
-    def __init__(
-        self, camera: CameraDriver, host: ComponentHost, tasks: BackgroundTasks, call: Callable[..., Any]
-    ) -> None:
+    def __init__(self, camera: CameraDriver, services: ComponentServices) -> None:
         self.vendor: str = camera.vendor
         self.model: str = camera.model
         self.resolution: tuple[int, int] = camera.resolution
@@ -220,8 +217,9 @@ class CameraAdapter(CameraDevice):
         self.sensor_mm: tuple[float, float] = camera.sensor_mm
         self.streams: tuple[str, ...] = camera.streams
         self.capabilities: int = capabilities_of(camera)
-        self.host: ServerHost = host
-        self._camera, self._host, self._tasks, self._call = camera, host, tasks, call
+        self.host: ServerHost = services.host
+        self._camera, self._host, self._tasks = camera, services.host, services.tasks
+        self._call = services.commands.call
         self.set_up_captures()
         self.running_streams: set[int] = set(range(1, len(self.streams) + 1))
 
@@ -403,7 +401,7 @@ class DefinedSettings(DefinedParameterServer):
 
 def add_camera(services: ComponentServices, camera: CameraDriver) -> None:
     host, streams = services.host, services.streams
-    adapter = CameraAdapter(camera, host, services.tasks, services.commands.call)
+    adapter = CameraAdapter(camera, services)
     if m.CameraInformation.ID in streams.builders:
         raise InvalidArgument("this component already has a camera: open another component for the second one")
     if camera.definition is not None:

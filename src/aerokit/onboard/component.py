@@ -268,7 +268,7 @@ class OnboardComponent:
         root = Path(directory)
         if not root.is_dir():
             raise InvalidArgument(f"directory = {str(directory)!r} is not an existing directory")
-        if self._ftp.files.has_root:
+        if self._ftp.files.root is not None:
             raise InvalidArgument("serve_files was called before: a component serves one directory")
         self._ftp.files = DirectoryFiles(root, self._memory, is_writable=writable)
 

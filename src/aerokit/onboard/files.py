@@ -76,13 +76,9 @@ class DirectoryFiles:
     """
 
     def __init__(self, root: Path | None, memory: FileTree, *, is_writable: bool) -> None:
-        self._root = None if root is None else root.resolve(strict=True)
+        self.root = None if root is None else root.resolve(strict=True)
         self._memory = memory
         self._is_writable = is_writable
-
-    @property
-    def has_root(self) -> bool:
-        return self._root is not None
 
     def __contains__(self, path: str) -> bool:
         try:
@@ -124,7 +120,7 @@ class DirectoryFiles:
     def entries(self, path: str) -> list[Entry]:
         """Return the names and sizes of files and directories, at most `MAX_ENTRIES`."""
         sizes: dict[str, int | None] = {}  # None for directories
-        if self._root is not None:
+        if self.root is not None:
             try:
                 with os.scandir(self._path(path)) as entries:
                     for entry in entries:
@@ -137,7 +133,7 @@ class DirectoryFiles:
             except (OSError, FileFault):
                 if path not in self._memory:  # A directory in memory need not exist on the disk.
                     raise
-        if self._root is None or path in self._memory:  # If only memory is served, this raises for an unknown path.
+        if self.root is None or path in self._memory:  # If only memory is served, this raises for an unknown path.
             sizes.update(self._memory.entries(path))
         return [Entry(name, size) for name, size in sorted(sizes.items())]
 
@@ -173,15 +169,15 @@ class DirectoryFiles:
         if not self._is_writable or path in self._memory:
             raise FileFault(EROFS)
         target = self._path(path)
-        if target == self._root:
+        if target == self.root:
             raise FileFault(EINVAL)
         return target
 
     def _path(self, path: str) -> Path:
         """Convert a client's path. Raise FileFault if the path leaves the root or contains a symbolic link."""
-        if self._root is None:
+        if self.root is None:
             raise FileFault(ENOENT)
-        target = self._root
+        target = self.root
         parts = [part for part in path.split("/") if part not in ("", ".")]
         for part in parts:
             has_windows_colon = os.name == "nt" and ":" in part  # a drive, or a second stream of a file

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -60,20 +60,14 @@ class Identity(Snapshot):
         return major << 24 | minor << 16 | patch << 8 | release_type
 
 
-class MetadataFile(NamedTuple):
-    """A metadata file. ``content()`` is called again for each COMPONENT_METADATA."""
-
-    path: str
-    content: Callable[[], bytes]
-
-
 class IdentityMessages:
     """Builds the messages that identify a component, and writes its metadata files."""
 
     def __init__(self, host: ComponentHost, identity: Identity, memory: FileTree) -> None:
         self.capabilities: int = int(Capability.MAVLINK2 | Capability.COMMAND_INT)
         """MAV_PROTOCOL_CAPABILITY of the protocols that are served."""
-        self._metadata_files: dict[int, MetadataFile] = {}  # by COMP_METADATA_TYPE
+        # By COMP_METADATA_TYPE: the path of a file, and the function that is called for its content.
+        self._metadata_files: dict[int, tuple[str, Callable[[], bytes]]] = {}
         self._host, self._identity, self._memory = host, identity, memory
 
     def builders(self) -> dict[int, Builder]:
@@ -115,10 +109,10 @@ class IdentityMessages:
     def update_files(self) -> int:
         """Write the metadata files; return the checksum of the general metadata file."""
         entries = []
-        for kind, file in self._metadata_files.items():
-            data = file.content()
-            self._memory.put(file.path, data)
-            entries.append({"type": kind, "uri": f"mftp://{file.path}", "fileCrc": crc32(data)})
+        for kind, (path, content) in self._metadata_files.items():
+            data = content()
+            self._memory.put(path, data)
+            entries.append({"type": kind, "uri": f"mftp://{path}", "fileCrc": crc32(data)})
         general = json.dumps({"version": 1, "metadataTypes": entries}).encode()
         self._memory.put(GENERAL_PATH, general)
         return crc32(general)
@@ -131,5 +125,5 @@ class IdentityMessages:
         return [m.ComponentMetadata(time_boot_ms=self._host.time_boot_ms, file_crc=checksum, uri=uri)]
 
     def add_metadata(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
-        self._metadata_files[kind] = MetadataFile(path, content)
+        self._metadata_files[kind] = (path, content)
         self.update_files()

@@ -417,13 +417,8 @@ def _check_target(target_system: int, command: int) -> None:
 
 def _checked_params(command: int, params: tuple[float, ...], count: int) -> list[float]:
     """Convert the parameters to floats, and add zeros for missing parameters."""
-    numbers = [0.0] * count
-    for index, value in enumerate(params):
-        if isinstance(value, (int, float)) and -FLOAT32_MAX <= value <= FLOAT32_MAX:
-            numbers[index] = float(value)  # the fast path for ordinary numbers
-        else:
-            numbers[index] = _checked_number(command, f"param{index + 1}", value)
-    return numbers
+    numbers = [_checked_number(command, f"param{number}", value) for number, value in enumerate(params, start=1)]
+    return numbers + [0.0] * (count - len(numbers))
 
 
 def _checked_number(command: int, field: str, value: float) -> float:

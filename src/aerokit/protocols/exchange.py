@@ -307,9 +307,14 @@ class Transfer(Exchange[ResultT]):
         self.on_progress: OnProgress | None = on_progress
         """Called with each progress report. Must not raise, because the next request is sent only after this call."""
 
-    def _start_clock(self, now: float) -> None:
+    def start(self, now: float) -> None:
         self._started_at = now
         self._progress_at = now
+        self._begin(now)
+
+    @abstractmethod
+    def _begin(self, now: float) -> None:
+        """Queue the first messages and set the deadline."""
 
     def _report_progress(self, now: float, done: int, total: int | None) -> None:
         self._progress_at = now

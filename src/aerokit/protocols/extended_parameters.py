@@ -62,8 +62,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
     noun = "settings"
     window_size = READ_WINDOW
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._send_list_request(now)
         self._proceed(now)
 
@@ -207,8 +206,7 @@ class SettingWrite(Transfer[Setting]):
         self._attempts = 0  # number of transmissions of the current request
         self._writes = 0  # number of PARAM_EXT_SET messages sent
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._write(now)
 
     def receive(self, message: Message, now: float) -> None:

@@ -338,9 +338,8 @@ class FtpRequest(FtpExchange[FtpMessage]):
         """True if the vehicle acknowledged the request."""
         return self._result is not None
 
-    def start(self, now: float) -> None:
+    def _begin(self, now: float) -> None:
         """Start the exchange: send the request, unless the caller sends it (``sent_by_caller``)."""
-        self._start_clock(now)
         self._transmit(now)
         if self._sent_by_caller:
             self._outbox.clear()

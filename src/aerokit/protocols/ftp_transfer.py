@@ -131,9 +131,8 @@ class FtpDownload(FtpExchange[int]):
         self._burst_active_at = 0.0  # time of the latest burst request or block of a burst
         self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
 
-    def start(self, now: float) -> None:
+    def _begin(self, now: float) -> None:
         """Request the first burst, and the blocks that are already known to be missing."""
-        self._start_clock(now)
         self._proceed(now)
 
     def expire(self, now: float) -> None:
@@ -391,8 +390,7 @@ class FtpUpload(FtpExchange[None]):
         self._written_bytes = 0
         self._sent_by_sequence: dict[int, _SentRequest] = {}
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         for offset in self._unwritten:
             if offset or not self._is_first_block_held:
                 self._requests.request(offset)

@@ -82,8 +82,7 @@ class LogDownload(Transfer[int]):
         # True if the previous range, or an earlier download into the same `Reassembly`, may have left long gaps.
         self._may_have_long_gaps = bool(into.gaps)
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._proceed(now)
 
     def receive(self, message: Message, now: float) -> None:
@@ -235,8 +234,7 @@ class LogStop(Transfer[None]):
     def message(self) -> LogRequestEnd:
         return LogRequestEnd(self.target_system, self.target_component)
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._wait(now)
 
     def receive(self, message: Message, now: float) -> None:
@@ -289,8 +287,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         self._stream = MessageStream(self.round_trip)
         self._previous_id = 0  # id of the latest entry, or the first requested id if no entry has followed the request
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._request(now, self._from_id, LAST_ID if self._to_id is None else self._to_id)
 
     def receive(self, message: Message, now: float) -> None:

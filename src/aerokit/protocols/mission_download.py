@@ -83,8 +83,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._restarts = 0
         self._has_error = False  # True if the vehicle has sent ERROR since the last answer to a request
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._received_at = now
         self._request_list(now)
 

@@ -121,8 +121,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     # --------------------------------------------------------------------------------- events
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._announce_items(now)
 
     def receive(self, message: Message, now: float) -> None:

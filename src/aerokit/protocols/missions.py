@@ -141,8 +141,7 @@ class MissionClear(MissionExchange[None]):
     expects: tuple[type[Message], ...] = (MissionAck,)
     _has_error = False  # True once ERROR was received and the request was repeated
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
@@ -231,8 +230,7 @@ class SetCurrentItem(Transfer[None]):
         self._order_status = order_status
         self._attempts = 0
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:

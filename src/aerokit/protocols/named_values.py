@@ -158,8 +158,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._sent_at: dict[str, float] = {}
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
-    def start(self, now: float) -> None:
-        self._start_clock(now)
+    def _begin(self, now: float) -> None:
         for name in self._names:
             self._window.request(name)
         self._proceed(now)

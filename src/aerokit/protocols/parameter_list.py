@@ -79,9 +79,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
 
     # ---------------------------------------------------------------------------- as an exchange
 
-    def start(self, now: float) -> None:
+    def _begin(self, now: float) -> None:
         """Request the list. If the round trip is unknown, also request one value by index to measure it."""
-        self._start_clock(now)
         self._send_list_request(now)
         if self.round_trip.smoothed_s is None:
             self._window.request(0)

@@ -109,7 +109,7 @@ def _broker(text: str) -> str:
 def _without_password(broker: str) -> str:
     from aerokit.apps.network.mqtt_publisher import parse_broker
 
-    return str(parse_broker(broker, "mqtt", "mqtts"))
+    return str(parse_broker(broker))
 
 
 async def _foxglove(options: argparse.Namespace) -> None:

@@ -53,7 +53,8 @@ class BaudRateProbe:
         self.bytes: int = 0
         self.frames: int = 0
         self._framer = Framer()
-        self._ended = asyncio.Event()
+        self.ended = asyncio.Event()
+        """Set when MAVLink is detected, or the port is lost."""
         self._loop = asyncio.get_running_loop()
         self.error: LinkLost | None = None
 
@@ -66,16 +67,11 @@ class BaudRateProbe:
         self._framer.receive(data, self._loop.time())
         self.frames = self._framer.statistics.frames
         if self.is_mavlink:
-            self._ended.set()
+            self.ended.set()
 
     def link_lost(self, error: LinkLost) -> None:
         self.error = error
-        self._ended.set()
-
-    async def wait(self, seconds: float) -> None:
-        """Wait until MAVLink is detected, the port is lost, or the time has passed."""
-        with anyio.move_on_after(seconds):
-            await self._ended.wait()
+        self.ended.set()
 
 
 async def listen_at(device: str, baud: int, seconds: float) -> BaudRateProbe:
@@ -87,7 +83,8 @@ async def listen_at(device: str, baud: int, seconds: float) -> BaudRateProbe:
     link = SerialLink(device, baud)
     await link.open(probe)
     try:
-        await probe.wait(seconds)
+        with anyio.move_on_after(seconds):
+            await probe.ended.wait()
     finally:
         link.close()
         await link.wait_closed()

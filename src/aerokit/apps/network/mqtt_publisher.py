@@ -59,26 +59,24 @@ class BrokerAddress(Snapshot):
         return f"<{self}>"
 
 
-def parse_broker(text: str, *schemes: str) -> BrokerAddress:
+def parse_broker(text: str) -> BrokerAddress:
     """Parse the address of a broker.
 
-    The allowed schemes are by default ``mqtt`` and ``mqtts``. Raises InvalidArgument if the address is invalid; the
-    error text never shows a password.
+    Raises InvalidArgument if the address is invalid; the error text never shows a password.
     """
-    allowed = schemes or tuple(PORTS)
     scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"
 
     def error(reason: str) -> InvalidArgument:
         shown_address = f"{scheme}://…" if "@" in text else text  # without the password
         return InvalidArgument(
             f"address = {shown_address!r} is not allowed: {reason}; expected"
-            f" {allowed[0]}://10.0.0.5:{PORTS[allowed[0]]}/fleet/alpha (% and @ : / ? # in a password: %25, %40 …)"
+            " mqtt://10.0.0.5:1883/fleet/alpha (% and @ : / ? # in a password: %25, %40 …)"
         )
 
-    if scheme not in allowed:
+    if scheme not in PORTS:
         if "@" in text:
             scheme = "…"  # not shown, because it may be a part of a password
-        raise error(f"the scheme is not {' or '.join(f'{name}://' for name in allowed)}")
+        raise error(f"the scheme is not {' or '.join(f'{name}://' for name in PORTS)}")
     try:
         parts = urlsplit(text.strip())
         host, port = parts.hostname, parts.port
@@ -302,7 +300,7 @@ async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
         InvalidArgument: the address is invalid.
         LinkOpenError: the broker cannot be reached or refuses the connection, or paho-mqtt is not installed.
     """
-    broker = parse_broker(address, "mqtt", "mqtts")
+    broker = parse_broker(address)
     link = ReconnectingLink(lambda: MqttLink(broker))
     await link.open(_NullReceiver())
     try:

@@ -239,7 +239,12 @@ class SessionFtpServer(Generic[FilesT]):
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
         path = self._path(request)
         is_reading = request.opcode == Op.OPENFILERO
-        size = self._size(path, reading=is_reading)
+        try:
+            size = self.files.size(path)
+        except FileFault:
+            if is_reading:
+                raise
+            size = 0
         if size > _MAX_SIZE:
             raise FileFault(EFBIG)
         may_create = not is_reading and self.creates_missing
@@ -250,14 +255,6 @@ class SessionFtpServer(Generic[FilesT]):
         client.sessions[number] = session
         self._close_when_idle(client, session)
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
-
-    def _size(self, path: str, *, reading: bool) -> int:
-        try:
-            return self.files.size(path)
-        except FileFault:
-            if reading:
-                raise
-            return 0
 
     def _close_when_idle(self, client: ServedClient, session: FtpSession) -> None:
         """Schedule the time-out that closes the session."""
