@@ -325,6 +325,10 @@ class Transfer(Exchange[ResultT]):
     def _idle_deadline(self) -> float:
         return self._progress_at + self._idle_timeout_s
 
+    def _wait_until(self, *times: float | None) -> None:
+        """Set the deadline to the earliest of these times, but not later than the idle time-out."""
+        self.deadline = min(at for at in (*times, self._idle_deadline) if at is not None)
+
     def _is_idle(self, now: float) -> bool:
         return now >= self._idle_deadline
 

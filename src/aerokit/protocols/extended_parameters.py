@@ -284,7 +284,7 @@ class SettingWrite(Transfer[Setting]):
     def _wait(self, now: float, *, is_writing: bool) -> None:
         self._is_writing = is_writing
         self._sent_at = now
-        self.deadline: float | None = min(now + self.round_trip.timeout_s(self._attempts), self._idle_deadline)
+        self._wait_until(now + self.round_trip.timeout_s(self._attempts))
 
     def _measure(self, now: float) -> None:
         if self._attempts == 1:

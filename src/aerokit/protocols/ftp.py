@@ -360,7 +360,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
         timeout_s = self.round_trip.timeout_s(max(1, self.attempts - ATTEMPTS_BEFORE_BACKOFF))
         if self._request.opcode == MavFtpOpcode.CALCFILECRC:
             timeout_s += SLOW_ANSWER_S * (self.attempts - 1)
-        self.deadline: float | None = min(now + timeout_s, self._idle_deadline)
+        self._wait_until(now + timeout_s)
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.sequence != (self._request.sequence + 1) % SEQUENCE_COUNT:

@@ -275,7 +275,7 @@ class FtpDownload(FtpExchange[int]):
             self._read(offset, now)
         if self._needs_burst:
             self._request_burst(now)
-        self._set_deadline()
+        self._wait_until(self._requests.deadline, self._next_block_deadline if self._is_bursting else None)
 
     def _request_gaps(self) -> None:
         while self._scanned_until < self._reassembly.tail:
@@ -327,15 +327,6 @@ class FtpDownload(FtpExchange[int]):
             max_lost = MAX_LOST_BLOCKS if has_started else MAX_LOST_FIRST_BLOCKS
             silence_s += max(max_lost * self._interval.smoothed_s, self._interval.timeout_s())
         return self._burst_active_at + silence_s
-
-    def _set_deadline(self) -> None:
-        deadline = self._idle_deadline
-        due_at = self._requests.deadline
-        if due_at is not None:
-            deadline = min(deadline, due_at)
-        if self._is_bursting:
-            deadline = min(deadline, self._next_block_deadline)
-        self.deadline: float | None = deadline
 
     # ------------------------------------------------------------------------------------ ends
 
@@ -436,8 +427,7 @@ class FtpUpload(FtpExchange[None]):
             self._requests.request(0)
         for offset in self._requests.take_due(now):
             self._write(offset, now)
-        due_at = self._requests.deadline
-        self.deadline: float | None = self._idle_deadline if due_at is None else min(self._idle_deadline, due_at)
+        self._wait_until(self._requests.deadline)
 
     def _write(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()

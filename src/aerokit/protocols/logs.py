@@ -158,7 +158,7 @@ class LogDownload(Transfer[int]):
             self._request_gaps(now)
         if not self._is_streaming and not reassembly.gaps:
             self._stream_range(reassembly.tail, self._size, now)
-        self._set_deadline()
+        self._wait_until(self._stream.due_at if self._is_streaming else self._requests.deadline)
 
     def _request_gaps(self, now: float) -> None:
         if self._may_have_long_gaps:
@@ -215,11 +215,6 @@ class LogDownload(Transfer[int]):
 
     def _send_end(self) -> None:
         self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-
-    def _set_deadline(self) -> None:
-        deadline = self._idle_deadline
-        due_at = self._stream.due_at if self._is_streaming else self._requests.deadline
-        self.deadline: float | None = deadline if due_at is None else min(deadline, due_at)
 
 
 class LogStop(Transfer[None]):
@@ -341,7 +336,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     def _set_deadline(self) -> None:
         if not self.done:
-            self.deadline: float | None = min(self._stream.due_at, self._idle_deadline)
+            self._wait_until(self._stream.due_at)
 
     def _timed_out(self) -> FileTimeout:
         if self._missing is None:

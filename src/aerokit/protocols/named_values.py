@@ -104,8 +104,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             return
         for index in self._window.take_due(now):
             self._outbox.append(self._read_request(index))
-        times = (self._window.deadline, self._stream_deadline, self._idle_deadline)
-        self.deadline: float | None = min(at for at in times if at is not None)
+        self._wait_until(self._window.deadline, self._stream_deadline)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
         """Drop the values that were reported with another count, and return their indices.
@@ -206,8 +205,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
             self._outbox += self._request(name)
             self._sent_at[name] = now
         self._send_probe_if_wanted(now)
-        times = (self._window.deadline, self._idle_deadline)
-        self.deadline: float | None = min(at for at in times if at is not None)
+        self._wait_until(self._window.deadline)
 
 
 class NamedReads(NamedRequests[ValueT]):
