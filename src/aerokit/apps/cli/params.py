@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.apps.cli import connecting
 from aerokit.apps.cli.arguments import assignment, writable_file
 from aerokit.apps.cli.completion import assignments, parameter_names, set_completions
-from aerokit.apps.cli.connecting import add_action
+from aerokit.apps.cli.connecting import add_action, connected
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, near_names, suggestion
 from aerokit.apps.cli.params_metadata import (
     add_metadata,
@@ -31,14 +30,15 @@ from aerokit.apps.parameter_values import with_range_note
 from aerokit.errors import AerokitError, InvalidArgument, ParameterRejected, ParameterTimeout, ValueUnknownError
 from aerokit.mavlink.enums import MavParamError
 from aerokit.parameters import checked_value
+
+# Needed only later, but an import during the connection would block the event loop.
+from aerokit.vehicle.parameters.parameters import ParameterWrite
 from aerokit.vehicle.parameters.writing import resolve_known
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
-    from contextlib import AbstractAsyncContextManager
 
     from aerokit.parameters import Metadata, Parameter, ParameterFile, ParameterTable
-    from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 # How long to read the names of the vehicle's parameters when only a suggestion needs them.
@@ -84,13 +84,6 @@ def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     load = add_action(actions, "load", _load, "Set all parameters in a file that differ on the vehicle.")
     load.add_argument("file")
     add_metadata(load, checks=True)
-
-
-def connected(options: argparse.Namespace, *, changes_vehicle: bool = False) -> AbstractAsyncContextManager[Vehicle]:
-    # Imported before connecting, because the import would block the event loop.
-    import aerokit.vehicle.parameters.parameters  # noqa: F401
-
-    return connecting.connected(options, changes_vehicle=changes_vehicle)
 
 
 async def _list(options: argparse.Namespace) -> int:
