@@ -100,6 +100,14 @@ def short_repr(value: object) -> str:
     return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
 
 
+def enum_name(enum: type[Enum], number: int, unknown: str) -> str:
+    """Return the name of the member with this number, or ``unknown`` if there is none."""
+    try:
+        return enum(number).name
+    except ValueError:
+        return unknown
+
+
 def with_article(noun: str) -> str:
     """Prepend the article: ``a Position``, ``an AttitudeSetpoint``."""
     return f"{'an' if noun[:1] in 'AEIO' else 'a'} {noun}"

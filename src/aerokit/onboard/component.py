@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import anyio
 
 from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.formatting import enum_name
 from aerokit.connection.tasks import BackgroundTasks, run_shielded
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
@@ -427,6 +428,5 @@ class OnboardComponent:
         self.connection.raise_if_ended()
 
     def __repr__(self) -> str:
-        kind = self._heartbeat.type
-        name = MavType(kind).name if kind in MavType.__members__.values() else kind
+        name = enum_name(MavType, self._heartbeat.type, str(self._heartbeat.type))
         return f"<OnboardComponent {self.system_id}/{self.component_id}, {name}>"

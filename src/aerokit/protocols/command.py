@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from aerokit._internal.formatting import enum_name
 from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
@@ -383,18 +384,13 @@ def rejection(command: int, result: int) -> CommandRejected:
 
 def command_name(command: int) -> str:
     """Return ``MAV_CMD_NAV_TAKEOFF`` for 22, or ``MAV_CMD 12345`` for an unknown number."""
-    try:
-        return f"MAV_CMD_{MavCmd(command).name}"
-    except ValueError:
-        return f"MAV_CMD {command}"
+    name = enum_name(MavCmd, command, unknown="")
+    return f"MAV_CMD_{name}" if name else f"MAV_CMD {command}"
 
 
 def result_name(result: int) -> str:
     """Return ``DENIED`` for 2, or ``MAV_RESULT 99`` for an unknown number."""
-    try:
-        return MavResult(result).name
-    except ValueError:
-        return f"MAV_RESULT {result}"
+    return enum_name(MavResult, result, unknown=f"MAV_RESULT {result}")
 
 
 _HINTS: dict[int, str] = {

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import anyio
 
+from aerokit._internal.formatting import enum_name
 from aerokit._internal.values import Snapshot
 from aerokit.apps.cli.output import emit
 from aerokit.connection.heartbeats import is_autopilot
@@ -225,7 +226,8 @@ class LinkExamination:
                 continue
             system, component = source
             versions = self._versions.get(source, set())
-            kind = "autopilot" if is_autopilot(heartbeat) else _type_name(heartbeat.type)
+            type_name = enum_name(MavType, heartbeat.type, f"type {heartbeat.type}").lower().replace("_", " ")
+            kind = "autopilot" if is_autopilot(heartbeat) else type_name.replace("gcs", "ground station")
             mavlink = " and ".join(str(version) for version in sorted(versions)) or "?"
             text = f"system {system}, component {component}: {kind}, MAVLink {mavlink}, {self._frames[source]} frames"
             if is_autopilot(heartbeat) and 2 not in versions:
@@ -289,10 +291,3 @@ class LinkExamination:
                 yield Finding("ok", "loss", text)
             else:
                 yield Finding("problem", "loss", text, _SERIAL_LOSS_ADVICE if is_serial else _NETWORK_LOSS_ADVICE)
-
-
-def _type_name(number: int) -> str:
-    try:
-        return MavType(number).name.lower().replace("_", " ").replace("gcs", "ground station")
-    except ValueError:
-        return f"type {number}"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
+from aerokit._internal.formatting import enum_name
 from aerokit.apps.cli.arguments import add_number
 from aerokit.apps.cli.connecting import add_link, add_seconds, await_vehicle, opened
 from aerokit.apps.cli.output import DONE, FAILED, emit
@@ -66,7 +67,7 @@ def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
     armed = {None: "armed or not: unknown", True: "ARMED", False: "disarmed"}[vehicle.armed.latest]
     landed = vehicle.landed_state.latest
     landed_text = "" if landed is None else f", {_in_words(getattr(landed, 'name', str(landed)))}"
-    type_text = "" if heartbeat is None else f", {_in_words(_enum_name(MavType, heartbeat.type))}"
+    type_text = "" if heartbeat is None else f", {_in_words(enum_name(MavType, heartbeat.type, str(heartbeat.type)))}"
     lacks_key = frame["signed"] and vehicle.connection.signing is None
     return [
         f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or '(unknown version)'}{type_text}"
@@ -98,7 +99,7 @@ def _component_record_and_text(heartbeat: Heartbeat, system_id: int, component_i
         "system_id": system_id,
         "component_id": component_id,
         "kind": kind,
-        "autopilot": _enum_name(MavAutopilot, heartbeat.autopilot),
+        "autopilot": enum_name(MavAutopilot, heartbeat.autopilot, str(heartbeat.autopilot)),
         "vehicle_type": heartbeat.type,
         **_frame_fields(heartbeat),
     }
@@ -184,13 +185,6 @@ def _percent(part: int, whole: int) -> str:
 
 def _in_words(name: str) -> str:
     return name.replace("_", " ").lower()
-
-
-def _enum_name(enum: type[MavType | MavAutopilot], number: int) -> str:
-    try:
-        return enum(number).name
-    except ValueError:
-        return str(number)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

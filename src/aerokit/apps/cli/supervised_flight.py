@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import shlex
 import sys
@@ -392,14 +391,14 @@ class FlightReport:
             self._armed_at = None
 
     async def _compare_clocks(self) -> None:
-        with self._vehicle.subscribe(GlobalPositionInt, capacity=100) as messages, contextlib.suppress(AerokitError):
+        with self._vehicle.subscribe(GlobalPositionInt, capacity=100) as messages, suppress(AerokitError):
             async for message in messages:
                 self._clocks.compare(self._vehicle.connection.now(), message.time_boot_ms)
 
     async def _print_events(self) -> None:
         with (
             self._vehicle.subscribe(events.StatusTextReceived, events.ModeChanged, capacity=100) as messages,
-            contextlib.suppress(AerokitError),
+            suppress(AerokitError),
         ):
             async for event in messages:
                 if isinstance(event, events.ModeChanged):
