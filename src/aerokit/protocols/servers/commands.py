@@ -204,9 +204,6 @@ class RunningCommands:
         self._ended: dict[tuple[int, ComponentIds], EndedCommand] = {}
         host.on(CommandCancel, self._on_cancel)
 
-    def __len__(self) -> int:
-        return len(self._running)
-
     def start(
         self, command: ReceivedCommand, cancel: Callable[[], bool], *, is_stop: bool = False
     ) -> RunningCommand | None:
