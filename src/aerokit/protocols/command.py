@@ -16,6 +16,19 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
 
+__all__ = [
+    "MAX_ATTEMPTS",
+    "UNREPEATABLE_COMMANDS",
+    "CommandExchange",
+    "OrderStatus",
+    "allowed_attempts",
+    "command_int",
+    "command_long",
+    "command_name",
+    "rejection",
+    "result_name",
+]
+
 MAX_ATTEMPTS = 4
 """Maximum number of transmissions of a command that may be repeated."""
 

@@ -12,6 +12,20 @@ from aerokit.errors import InvalidArgument
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
+__all__ = [
+    "IDLE_TIMEOUT_S",
+    "Exchange",
+    "MessageStream",
+    "OnProgress",
+    "RoundTrip",
+    "StaleAnswerFilter",
+    "Transfer",
+    "TransferOptions",
+    "TransferProgress",
+    "format_ranges",
+    "is_addressed_to",
+]
+
 ResultT = TypeVar("ResultT")
 
 

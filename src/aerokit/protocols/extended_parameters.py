@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from aerokit.parameters.parameter import SettingValue
     from aerokit.protocols.exchange import TransferOptions
 
+__all__ = ["SettingAnswer", "SettingList", "SettingReads", "SettingWrite", "setting_of"]
+
 SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 

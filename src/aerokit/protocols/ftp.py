@@ -20,6 +20,18 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
 
+__all__ = [
+    "DATA_SIZE",
+    "PATH_SIZE",
+    "FtpClient",
+    "FtpExchange",
+    "FtpMessage",
+    "FtpRequest",
+    "FtpSessionLost",
+    "file_error",
+    "path_bytes",
+]
+
 DATA_SIZE = 239
 """Maximum number of data bytes in one message."""
 

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     from aerokit.protocols.blocks import Reassembly
 
+__all__ = ["FtpDownload", "FtpUpload", "is_virtual"]
+
 # Errors by which servers answer a burst request if they do not support bursts.
 NO_BURST = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 WINDOW_DURING_BURST = 4

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.blocks import Reassembly
 
+__all__ = ["LOG_BLOCK", "LogDownload", "LogList", "LogStop"]
+
 LOG_BLOCK = 90
 """Number of log bytes in one message."""
 

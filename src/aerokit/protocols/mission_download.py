@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.missions.item import MissionItem as Item
 
+__all__ = ["DownloadResult", "MissionDownload"]
+
 # Maximum number of restarts without a new item.
 MAX_RESTARTS = 8
 

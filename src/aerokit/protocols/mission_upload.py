@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.missions.item import MissionItem
 
+__all__ = ["MissionUpload", "UploadResult"]
+
 MAX_RESTARTS = 3
 # An item is not repeated before this fraction of a round trip has passed, because its answer cannot have arrived yet.
 IN_FLIGHT_ROUND_TRIPS = 0.8

@@ -25,6 +25,16 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.protocols.command import OrderStatus
 
+__all__ = [
+    "BUSY_RETRY_INTERVAL_S",
+    "BUSY_TIMEOUT_S",
+    "TRANSFER_EXPIRY_S",
+    "MissionClear",
+    "MissionExchange",
+    "SetCurrentItem",
+    "mission_checksum",
+]
+
 ResultT = TypeVar("ResultT")
 
 # A vehicle is busy for at most this many seconds with a transfer that another station has abandoned. ArduPilot drops

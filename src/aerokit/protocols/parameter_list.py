@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.exchange import TransferOptions
 
+__all__ = ["ParameterList", "merge_update"]
+
 
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
     """Merge a PARAM_VALUE that is not part of a list into a known parameter."""

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.exchange import TransferOptions
 
+__all__ = ["ParameterAnswer", "ParameterReads", "ParameterRequests", "ParameterWrites", "rejection"]
+
 ParameterAnswer = Parameter | ParameterRejected | ParameterTimeout
 """Answer to one request: the parameter as the vehicle reports it, or the error."""
 
