@@ -170,10 +170,10 @@ class BlockRequests(PendingRequests[int]):
             lost.append(offset)
         self._requeue(lost)
 
-    def _requeue(self, offsets: list[int]) -> None:
-        for _ in offsets:
+    def _requeue(self, keys: list[int]) -> None:
+        for _ in keys:
             self.window.on_loss()
-        super()._requeue(offsets)
+        super()._requeue(keys)
 
 
 WriteBytes = Callable[[bytes], object]
