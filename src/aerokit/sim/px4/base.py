@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -46,8 +47,8 @@ class Px4Vehicle(Px4Host):
     CAPABILITIES: ClassVar[int] = 0xE8FF
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
     PARAMETER_TABLE: ClassVar[str] = "quadrotor"
-
-    events: Px4Events
+    FLIGHT: ClassVar[type[Px4Flight]] = Px4Flight
+    MISSION: ClassVar[type[Px4Mission]] = Px4Mission
 
     def __init__(
         self,
@@ -91,9 +92,9 @@ class Px4Vehicle(Px4Host):
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.boot_time_s: float = boot_time_s
         self.rates: Px4StreamRates = Px4StreamRates(link_modes, self.can_build, fast_rate_hz)
-        self.events = Px4Events(self)
+        self.events: Px4Events = Px4Events(self)
         self._next_text_id = 0
-        self._pings = 0  # number of PINGs sent
+        self.ping_numbers: Iterator[int] = itertools.count()  # sequence numbers of the next PINGs
         self.home: Ned = (0.0, 0.0, 0.0)  # In the local frame, whose zero point is the argument `home`.
         self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points, which survive a reboot."""
@@ -117,12 +118,6 @@ class Px4Vehicle(Px4Host):
         limits = MotionLimits(acceleration_m_s2=3.0, vertical_acceleration_m_s2=3.0, lean_rad=math.radians(45))
         return Motion(self.rng, limits, wind)
 
-    def _make_flight(self) -> Px4Flight:
-        return Px4Flight(self)
-
-    def _make_mission(self) -> Px4Mission:
-        return Px4Mission(self)
-
     def _reset(self) -> None:
         """Set the state after a power-on."""
         self._reset_state()
@@ -130,8 +125,8 @@ class Px4Vehicle(Px4Host):
         self.arming: Px4Arming = Px4Arming(self, self.calibration)
         self.vtol_state: int = 0
         """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL. The motion of the vehicle does not change."""
-        self.flight: Px4Flight = self._make_flight()
-        self.mission: Px4Mission = self._make_mission()
+        self.flight: Px4Flight = self.FLIGHT(self)
+        self.mission: Px4Mission = self.MISSION(self)
         self.text_links: Px4TextLinks = Px4TextLinks(self)
         self.failsafes: Px4Failsafes = Px4Failsafes(self, self.text_links)
         self.missions.reset()
@@ -156,12 +151,6 @@ class Px4Vehicle(Px4Host):
     def airspeed_m_s(self) -> float:
         """Airspeed that the vehicle measures, in m/s; NaN without an airspeed sensor."""
         return math.nan
-
-    def next_ping(self) -> int:
-        """Return the sequence number of the next PING."""
-        sequence = self._pings
-        self._pings += 1
-        return sequence
 
     def boot(self) -> None:
         self.storage.restart()
@@ -237,7 +226,7 @@ class Px4Vehicle(Px4Host):
         return not self.is_landed
 
     def _run_motors(self, dt: float) -> None:
-        self.throttle = 0.0
+        self.throttle: float = 0.0
         if self.is_armed and not self.is_landed:
             self.throttle = min(1.0, _HOVER_THROTTLE * self.motion.thrust_share)
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)

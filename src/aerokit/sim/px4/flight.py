@@ -141,7 +141,7 @@ class Px4Flight:
         self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL, which is home or a rally point.
         self.heading: float | None = None  # Heading in radians; None if the nose points in the direction of flight.
         self.speed_m_s: float = 0.0
-        self.radius_m: float = 0.0  # Radius of the circle that a plane flies.
+        self.radius_m: float = 0.0  # Radius of a plane's circle; a negative radius is counter-clockwise.
         self.lifts_off: bool = False  # True if the mode makes the vehicle leave the ground.
         self.manual_flight: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
