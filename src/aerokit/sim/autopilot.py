@@ -305,15 +305,12 @@ _RESISTANCE_OHM = 0.012
 class SimulatedBattery:
     """A lithium battery pack. Its voltage depends on the charge, and sags under a current."""
 
-    consumed_mah: float
-    consumed_wh: float
-
     def __init__(self, capacity_mah: float = 3300.0, *, cells: int = 3, percent: float = 100.0) -> None:
         self.capacity_mah = capacity_mah
         self.cells = cells
-        self.consumed_mah = 0.0
+        self.consumed_mah: float = 0.0
         """Charge in mAh that was consumed since power-on, as a current sensor counts it."""
-        self.consumed_wh = 0.0
+        self.consumed_wh: float = 0.0
         self.current_a: float = 0.0
         self._charge_mah = capacity_mah * percent / 100.0
 

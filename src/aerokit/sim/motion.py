@@ -150,11 +150,6 @@ class Motion:
     A ``seek_…`` method sets the target; ``step`` moves towards it. The ground is level at ``ground_down``.
     """
 
-    north: float
-    east: float
-    roll: float
-    pitch: float
-
     def __init__(
         self, rng: random.Random, limits: MotionLimits | None = None, wind: SimulatedWind | None = None
     ) -> None:
@@ -162,8 +157,8 @@ class Motion:
         self.wind: SimulatedWind = wind if wind is not None else SimulatedWind()
         self._rng = rng
         self.ground_down: float = 0.0
-        self.north = 0.0
-        self.east = 0.0
+        self.north: float = 0.0
+        self.east: float = 0.0
         self.down: float = 0.0
         self.velocity_north: float = 0.0
         self.velocity_east: float = 0.0
@@ -171,8 +166,8 @@ class Motion:
         self.acceleration_north: float = 0.0
         self.acceleration_east: float = 0.0
         self.acceleration_down: float = 0.0
-        self.roll = 0.0
-        self.pitch = 0.0
+        self.roll: float = 0.0
+        self.pitch: float = 0.0
         self.yaw: float = 0.0
         self.roll_rate: float = 0.0
         self.pitch_rate: float = 0.0

@@ -238,20 +238,17 @@ class SimulatedVehicle:
         self.call_at(self.now + silence_s, self.power_on)
 
     def boot(self) -> None:
-        """Called at power-on."""
-        raise NotImplementedError
+        """Called at power-on. By default, does nothing."""
 
     def start_channel(self, channel: Channel) -> None:
-        """Start the default streams of a port."""
-        raise NotImplementedError
+        """Start the default streams of a port. By default, there are none."""
 
     def build(self, message_id: int) -> Message | None:
         """Return the current message of this id; None if there is none."""
-        raise NotImplementedError
+        return None
 
     def tick(self, dt: float) -> None:
         """Advance the vehicle by ``dt`` seconds, which is TICK_S or, in steady flight, a multiple of TICK_S."""
-        raise NotImplementedError
 
     @property
     def is_steady(self) -> bool:

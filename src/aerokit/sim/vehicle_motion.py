@@ -50,7 +50,6 @@ class FixedWing(Motion):
     north: float
     east: float
     down: float
-
     roll: float
     pitch: float
 
@@ -90,15 +89,14 @@ class FixedWing(Motion):
 
     def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
         """Fly towards a point, without slowing down or circling there."""
-        course = math.atan2(east - self.east, north - self.north)
-        self.head(course, airspeed, self.climb_rate_to(down))
+        self.head(self.bearing_to((north, east, down)), airspeed, self.climb_rate_to(down))
 
     def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
         """Circle a point. A negative radius is counter-clockwise."""
         turn_sign = math.copysign(1.0, radius)
         radius = max(1.0, abs(radius))
-        distance = math.hypot(north - self.north, east - self.east)
-        course_to_center = math.atan2(east - self.east, north - self.north)
+        center = (north, east, down)
+        distance, course_to_center = self.distance_to(center), self.bearing_to(center)
         # Far away, the course points to the center. On the circle, the course is the tangent. In between, the course
         # changes gradually from the direction of the center to the tangent.
         share_to_center = max(-1.0, min(1.0, (distance - radius) / radius))
@@ -235,16 +233,13 @@ class GroundMotion(Motion):
 
     north: float
     east: float
-    down: float
-
-    speed_m_s: float
 
     def __init__(
         self, rng: random.Random, wheels: GroundLimits | None = None, wind: SimulatedWind | None = None
     ) -> None:
         super().__init__(rng, wind=wind)
         self.wheels: GroundLimits = wheels if wheels is not None else GroundLimits()
-        self.speed_m_s = 0.0
+        self.speed_m_s: float = 0.0
         """Forward speed; negative is backwards."""
         self._wanted_speed = 0.0
         self._wanted_turn_rate = 0.0

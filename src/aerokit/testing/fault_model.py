@@ -77,23 +77,16 @@ class FaultyPath:
     - ``duplicated``, ``reordered``, ``corrupted``: arriving frames with these faults.
     """
 
-    frames: int
-    lost: int
-    overflowed: int
-    duplicated: int
-    reordered: int
-    corrupted: int
-
     def __init__(self, model: FaultModel, seed: object = 0, air: Air | None = None) -> None:
         self.model = model
         """Faults of this direction. The model may be replaced at any time."""
-        self.frames = 0
+        self.frames: int = 0
         self.bytes: int = 0
-        self.lost = 0
-        self.overflowed = 0
-        self.duplicated = 0
-        self.reordered = 0
-        self.corrupted = 0
+        self.lost: int = 0
+        self.overflowed: int = 0
+        self.duplicated: int = 0
+        self.reordered: int = 0
+        self.corrupted: int = 0
         self._chance = random.Random(repr(seed)).random  # decides which frames have a fault
         self._bits = random.Random(repr((seed, "bits")))  # selects the bits to flip
         self._air = Air() if air is None else air

@@ -78,12 +78,7 @@ class Flight:
 
     def run(self, main: Callable[[Flight], Awaitable[T]]) -> T:
         """Open the flight, run ``main(flight)`` on virtual time and close the flight. For tests without ``async``."""
-
-        async def fly() -> T:
-            async with self._fleet.open():
-                return await main(self)
-
-        return run_virtual(fly())
+        return self._fleet.run(lambda _: main(self))
 
 
 class SimulatedFleet(Sequence[Flight]):

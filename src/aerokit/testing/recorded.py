@@ -42,7 +42,6 @@ class RecordedParameters(ParameterProtocolServer):
     """Handles PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET."""
 
     starts_at_once = True
-    names: list[str]
 
     def __init__(self, vehicle: RecordedVehicle) -> None:
         super().__init__(vehicle, self, list_rate_hz=_LIST_RATE_HZ)
@@ -56,7 +55,7 @@ class RecordedParameters(ParameterProtocolServer):
         indices = {value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX}
         without_index = [name for name in self._recorded if name not in indices]
         is_complete = bool(indices) and len(indices) == max(value.param_count for value in values)
-        self.names = sorted(indices, key=lambda name: (indices[name], name))
+        self.names: list[str] = sorted(indices, key=lambda name: (indices[name], name))
         """Names in the order in which the vehicle lists its parameters."""
         self.names += [name for name in without_index if name != HASH_NAME]
         # PX4's hash covers all parameters, so the recorded hash is wrong for an incomplete list of parameters.
@@ -269,15 +268,6 @@ class RecordedVehicle(SimulatedVehicle):
         # The tolerance includes messages that were recorded at exactly the start time.
         self._next = bisect_right([time for time, _ in stream], self._start_s - 1e-9)
         self._schedule_next()
-
-    def start_channel(self, channel: Channel) -> None:
-        """Do nothing: the recorded streams are sent on every channel."""
-
-    def build(self, message_id: int) -> Message | None:
-        """Return None: only recorded messages are streamed."""
-
-    def tick(self, dt: float) -> None:
-        """Do nothing: motion is recorded, not simulated."""
 
     def _schedule_next(self) -> None:
         stream = self.recording.stream

@@ -49,12 +49,6 @@ class FlightScheduler(SimulatedVehicle):
     def receive(self, data: bytes, now: float, peer: Hashable = None, channel: Channel | None = None) -> None:
         self.step(now)
 
-    def boot(self) -> None:
-        """Do nothing."""
-
-    def start_channel(self, channel: Channel) -> None:
-        """Do nothing: a stage sends no first messages to a new client."""
-
     def do(self, action: Callable[[], None], *, after_s: float) -> None:
         """Run an action after ``after_s`` simulated seconds. 0 means at once."""
         if after_s:

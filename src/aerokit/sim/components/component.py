@@ -52,7 +52,7 @@ def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpSer
     The files may change at any time, see `FileTree.put`. A power cycle ends the sessions, but keeps the files. The
     component's ``faults.no_ftp`` turns the server off.
     """
-    from aerokit.sim.px4.ftp import Px4Ftp  # imported only when needed, because most components serve no files
+    from aerokit.sim.px4.storage import Px4Ftp  # imported only when needed, because most components serve no files
 
     server = Px4Ftp(component, files)
     component.on_power_on(server.restart)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 from functools import partial
 
@@ -72,7 +72,7 @@ class Px4Calibration:
             self._measure(*_AUTOMATIC_CALIBRATIONS[sensor])
         elif sensor in _SIDE_INSTRUCTIONS:
             self._start(sensor)
-            self._begin_side(0, self._run_number)
+            self._begin_side(0)
         elif sensor == "esc":
             # PX4 requires a disconnected battery, but the simulated battery is always connected (esc_calibration.cpp,
             # check_battery_disconnected).
@@ -90,42 +90,42 @@ class Px4Calibration:
         self._run_number += 1
         self._px4.info(f"[cal] calibration started: 2 {sensor}")
 
+    def _later(self, delay_s: float, action: Callable[[], None]) -> None:
+        """Run an action after ``delay_s``, unless this calibration has ended by then."""
+        run_number = self._run_number
+
+        def run() -> None:
+            if self.is_running and run_number == self._run_number:
+                action()
+
+        self._px4.call_later(delay_s, run)
+
     def _measure(self, percents: Sequence[int], step_s: float) -> None:
         self._send_later([f"progress <{percent}>" for percent in percents], step_s)
-        run_number = self._run_number
-        self._px4.call_later((len(percents) + 1) * step_s, lambda: self._end(run_number))
+        self._later((len(percents) + 1) * step_s, self._end)
 
     def _send_later(self, texts: Sequence[str], step_s: float) -> None:
         for index, text in enumerate(texts):
-            self._px4.call_later(index * step_s, partial(self._send, text, self._run_number))
+            self._later(index * step_s, partial(self._px4.info, f"[cal] {text}"))
 
-    def _send(self, text: str, run_number: int) -> None:
-        if self.is_running and run_number == self._run_number:
-            self._px4.info(f"[cal] {text}")
-
-    def _begin_side(self, sides_done: int, run_number: int) -> None:
-        if not self.is_running or run_number != self._run_number:  # The calibration was cancelled.
-            return
+    def _begin_side(self, sides_done: int) -> None:
         if sides_done == len(_SIDES):
-            self._end(run_number)
+            self._end()
             return
         texts = _side_texts(self._sensor, sides_done)
         self._send_later(texts, _SIDE_INTERVAL_S)
         if math.isfinite(self.side_s):  # With an infinite `side_s`, the measurement of a side never ends.
-            delay_s = len(texts) * _SIDE_INTERVAL_S + self.side_s
-            self._px4.call_later(delay_s, lambda: self._end_side(sides_done, run_number))
+            self._later(len(texts) * _SIDE_INTERVAL_S + self.side_s, lambda: self._end_side(sides_done))
 
-    def _end_side(self, sides_done: int, run_number: int) -> None:
-        if self.is_running and run_number == self._run_number:
-            done = f"{_SIDES[-1 - sides_done]} side done, rotate to a different side"
-            percent = min(100, _PERCENT_PER_SIDE * (sides_done + 1))
-            self._send_later([f"progress <{percent}>", done, done], 0.02)
-            self._px4.call_later(0.2, lambda: self._begin_side(sides_done + 1, run_number))
+    def _end_side(self, sides_done: int) -> None:
+        done = f"{_SIDES[-1 - sides_done]} side done, rotate to a different side"
+        percent = min(100, _PERCENT_PER_SIDE * (sides_done + 1))
+        self._send_later([f"progress <{percent}>", done, done], 0.02)
+        self._later(0.2, lambda: self._begin_side(sides_done + 1))
 
-    def _end(self, run_number: int) -> None:
-        if self.is_running and run_number == self._run_number:
-            self._px4.info(f"[cal] calibration done: {self._sensor}")
-            self._sensor = ""
+    def _end(self) -> None:
+        self._px4.info(f"[cal] calibration done: {self._sensor}")
+        self._sensor = ""
 
     def _cancel(self) -> None:
         self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration cancelled")

@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import partial
 from typing import ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavType
+from aerokit.mavlink.enums import MavType
 from aerokit.mavlink.signing import SigningKey
 from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
 from aerokit.sim.channel import Channel
@@ -19,7 +20,6 @@ from aerokit.sim.commands import CommandHandler, CommandServer
 from aerokit.sim.logs import DEFAULT_LOGS, SimulatedLog
 from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters
-from aerokit.sim.px4 import modes
 from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
 from aerokit.sim.px4.console import Px4LogStream, Px4Shell
 from aerokit.sim.px4.external import Px4External
@@ -30,7 +30,6 @@ from aerokit.sim.px4.links import Px4Events, Px4StreamRates, Px4TextLinks, on_th
 from aerokit.sim.px4.manual import Px4Sticks
 from aerokit.sim.px4.mission import Px4Mission
 from aerokit.sim.px4.mission_server import Px4MissionServer
-from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.offboard import Px4Offboard
 from aerokit.sim.px4.payload import Px4CameraTrigger, Px4Gimbal
 from aerokit.sim.px4.storage import Px4Signing, Px4Storage, px4_parameters
@@ -38,10 +37,8 @@ from aerokit.sim.vehicle import AttachableComponent, sender_of
 
 # Shares of the boot time after which the streams start, and pre-arm warnings are sent.
 _HEARTBEAT_BOOT_SHARE, _WARNING_BOOT_SHARE = 0.2, 0.3
-_LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
 _AMPERES_AT_FULL = 40.0
-_MODES_ENDED_BY_LANDING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_LAND, modes.RTL})
 
 
 class Px4Vehicle(Px4Host):
@@ -50,8 +47,8 @@ class Px4Vehicle(Px4Host):
     CAPABILITIES: ClassVar[int] = 0xE8FF
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
     PARAMETER_TABLE: ClassVar[str] = "quadrotor"
-
-    events: Px4Events
+    FLIGHT: ClassVar[type[Px4Flight]] = Px4Flight
+    MISSION: ClassVar[type[Px4Mission]] = Px4Mission
 
     def __init__(
         self,
@@ -93,11 +90,11 @@ class Px4Vehicle(Px4Host):
         self.battery: SimulatedBattery = SimulatedBattery(5000.0, cells=4, percent=battery_percent)
         self.motion: Motion = self._make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
-        self._boot_time_s = boot_time_s
+        self.boot_time_s: float = boot_time_s
         self.rates: Px4StreamRates = Px4StreamRates(link_modes, self.can_build, fast_rate_hz)
-        self.events = Px4Events(self)
+        self.events: Px4Events = Px4Events(self)
         self._next_text_id = 0
-        self._pings = 0  # number of PINGs sent
+        self.ping_numbers: Iterator[int] = itertools.count()  # sequence numbers of the next PINGs
         self.home: Ned = (0.0, 0.0, 0.0)  # In the local frame, whose zero point is the argument `home`.
         self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points, which survive a reboot."""
@@ -121,33 +118,15 @@ class Px4Vehicle(Px4Host):
         limits = MotionLimits(acceleration_m_s2=3.0, vertical_acceleration_m_s2=3.0, lean_rad=math.radians(45))
         return Motion(self.rng, limits, wind)
 
-    def _make_flight(self) -> Px4Flight:
-        return Px4Flight(self)
-
-    def _make_mission(self) -> Px4Mission:
-        return Px4Mission(self)
-
     def _reset(self) -> None:
         """Set the state after a power-on."""
-        self.is_ready: bool = False
-        self.is_armed: bool = False
-        self.is_landed: bool = True
-        self.mode: Px4Mode = modes.HOLD
-        self.intended_mode: Px4Mode = modes.HOLD
-        self.is_in_failsafe: bool = False
+        self._reset_state()
         self.calibration: Px4Calibration = Px4Calibration(self)
         self.arming: Px4Arming = Px4Arming(self, self.calibration)
-        self.throttle: float = 0.0
-        # True if a client has set home. Otherwise, arming sets home to the position of the vehicle.
-        self.home_is_set_by_client = False
-        self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
         """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL. The motion of the vehicle does not change."""
-        self._touchdown_at = math.nan  # NaN while the vehicle does not touch the ground
-        self._landed_at = math.nan  # when the landing was detected; NaN before
-        self._has_flown = False  # True after a take-off, until the vehicle is armed again
-        self.flight: Px4Flight = self._make_flight()
-        self.mission: Px4Mission = self._make_mission()
+        self.flight: Px4Flight = self.FLIGHT(self)
+        self.mission: Px4Mission = self.MISSION(self)
         self.text_links: Px4TextLinks = Px4TextLinks(self)
         self.failsafes: Px4Failsafes = Px4Failsafes(self, self.text_links)
         self.missions.reset()
@@ -173,31 +152,14 @@ class Px4Vehicle(Px4Host):
         """Airspeed that the vehicle measures, in m/s; NaN without an airspeed sensor."""
         return math.nan
 
-    @property
-    def has_position(self) -> bool:
-        """True if the estimator has a global position."""
-        has_global = self.external.has_gps or (self.external.has_vision and self.has_origin)
-        return self.uptime >= 0.5 * self._boot_time_s and has_global
-
-    @property
-    def has_origin(self) -> bool:
-        """True if the local frame has a global origin."""
-        return self.external.has_gps or self.external.origin is not None
-
-    def next_ping(self) -> int:
-        """Return the sequence number of the next PING."""
-        sequence = self._pings
-        self._pings += 1
-        return sequence
-
     def boot(self) -> None:
         self.storage.restart()
         self.camera_trigger.restart()
         self.gimbal.start()
-        self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
+        self.call_later(_WARNING_BOOT_SHARE * self.boot_time_s, self._warn_while_booting)
         self.mission.start()
         self.failsafes.start()
-        self.call_later(self._boot_time_s, self._set_ready)
+        self.call_later(self.boot_time_s, self._set_ready)
 
     def _warn_while_booting(self) -> None:
         self.arming.report_reasons()
@@ -209,9 +171,9 @@ class Px4Vehicle(Px4Host):
 
     def start_channel(self, channel: Channel) -> None:
         """Start the default streams."""
-        first = max(self.now, self.booted_at + _HEARTBEAT_BOOT_SHARE * self._boot_time_s)
+        first = max(self.now, self.booted_at + _HEARTBEAT_BOOT_SHARE * self.boot_time_s)
         self.rates.start(channel, self.channels.index(channel), first)
-        ready_at = max(self.now, self.booted_at + self._boot_time_s)
+        ready_at = max(self.now, self.booted_at + self.boot_time_s)
         # PX4 does not stream the origin, but sends it once, and again after a change.
         self.call_at(ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel))
 
@@ -241,87 +203,6 @@ class Px4Vehicle(Px4Host):
     def send_parts(self, chunks: list[m.Statustext]) -> None:
         self.text_links.send(chunks)
 
-    def on_armed(self) -> None:
-        """Start the mode that was entered while disarmed, and set home."""
-        self.is_armed = True
-        self._has_flown = False
-        self._landed_at = math.nan
-        if not self.home_is_set_by_client:
-            self.home = self.motion.place
-        self.failsafes.on_armed()
-        # MISSION and TAKEOFF may have been entered while disarmed. They start when the vehicle is armed.
-        if self.mode == modes.MISSION:
-            self.mission.enter()
-        elif self.mode == modes.TAKEOFF:
-            self.flight.announce_take_off()
-        self.set_ticking(True)
-
-    def on_disarmed(self) -> None:
-        self.is_armed = False
-        self.throttle = 0.0
-        self.is_in_failsafe = False
-
-    def terminate(self) -> None:
-        """Stop the motors until a restart."""
-        self.arming.terminate()
-        self.switch_to(modes.TERMINATION)
-
-    def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request. Return False if an armed vehicle cannot run the mode. LAND is never refused."""
-        if self.is_armed and mode != modes.LAND and not self.can_run(mode):
-            return False
-        if mode not in _MODES_ENDED_BY_LANDING:
-            self.mode_after_landing = mode
-        self.is_in_failsafe = False
-        self.intended_mode = mode
-        self.failsafes.override()
-        # A request for the present mode restarts MISSION. In any other mode, the vehicle stays at its present position.
-        if mode == self.mode == modes.MISSION:
-            self.mission.enter()
-        elif mode == self.mode:
-            self.flight.stay_here()
-        else:
-            self.switch_to(mode)
-        if mode == modes.TAKEOFF:
-            self.flight.plan_take_off()
-        return True
-
-    def can_run(self, mode: Px4Mode) -> bool:
-        """Return True if everything the mode needs is available.
-
-        Depending on the mode, these are stick input, a valid mission, set-points, and a position estimate.
-        """
-        traits = modes.MODES.get(mode)
-        if traits is None or self.arming.is_terminated:
-            return False
-        if mode == modes.MISSION and not self.mission.is_valid:
-            return False
-        if mode == modes.OFFBOARD and not self.offboard.is_fresh:
-            return False
-        if traits.needs_sticks and not self.sticks.are_fresh:
-            return False
-        return self.has_position or not traits.needs_position
-
-    def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode, which the next heartbeat reports."""
-        self.mode = mode
-        self.flight.enter(mode)
-        if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle about a return.
-            all_components = 0
-            self.send_command((self.system_id, all_components), MavCmd.NAV_RETURN_TO_LAUNCH)
-
-    def leave_ground(self) -> None:
-        self.is_landed = False
-        self._has_flown = True
-        self._touchdown_at = math.nan
-        self.info("Takeoff detected")
-
-    def on_sticks_moved(self, distance: float) -> None:
-        """Switch to POSITION if the sticks moved far enough and the present mode can be overridden."""
-        if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(distance):
-            self.info("Pilot took over using sticks")
-            self.change_mode(modes.POSITION)
-
     def tick(self, dt: float) -> None:
         """Update mode, motion, land detector, battery and motors."""
         if self.is_armed:
@@ -344,36 +225,11 @@ class Px4Vehicle(Px4Host):
     def _is_moving(self) -> bool:
         return not self.is_landed
 
-    def _has_touched_down(self) -> bool:
-        return self.motion.is_on_ground
-
     def _run_motors(self, dt: float) -> None:
-        self.throttle = 0.0
+        self.throttle: float = 0.0
         if self.is_armed and not self.is_landed:
             self.throttle = min(1.0, _HOVER_THROTTLE * self.motion.thrust_share)
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
-
-    def _detect_landing(self) -> None:
-        is_lifting_off = self.is_armed and self.flight.lifts_off
-        if not self._has_touched_down() or is_lifting_off or self.arming.is_terminated:
-            self._touchdown_at = math.nan
-        elif math.isnan(self._touchdown_at):
-            self._touchdown_at = self.now
-        elif self.now - self._touchdown_at >= _LAND_DETECTOR_S or not self.is_armed:
-            self.is_landed = True
-            self._landed_at = self.now
-            self.motion.settle()
-            self.info("Landing detected")
-            self.mission.on_landed()
-
-    def _auto_disarm(self) -> None:
-        if not self.is_armed or not self.is_landed or self.flight.lifts_off:
-            return
-        if self._has_flown:
-            if 0 < self.parameters["COM_DISARM_LAND"] <= self.now - self._landed_at:
-                self.arming.disarm("landing")
-        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.armed_at:
-            self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
         # A PING with an address is an answer itself, so it is not answered.

@@ -48,20 +48,6 @@ _STORAGE_ACTIONS = range(5)
 _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000  # param 5 of ACTUATOR_TEST
 
 
-def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
-    handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None sends no acknowledgement.
-    handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
-    handlers[Cmd.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
-    handlers[Cmd.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)
-    handlers[Cmd.LOGGING_START] = lambda command: px4.log_stream.start(command)
-    handlers[Cmd.LOGGING_STOP] = lambda command: px4.log_stream.stop(command)
-    handlers[Cmd.DO_GRIPPER] = lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S)
-    handlers[Cmd.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
-    handlers[Cmd.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
-    return handlers
-
-
 # Units that can fail in SIH, with their failure types: the motors (FailureInjector.cpp) and the battery
 # (BatterySimulator.cpp).
 _FAILURES = {
@@ -116,7 +102,8 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.SET_MESSAGE_INTERVAL: requests.set_interval,
         Cmd.GET_MESSAGE_INTERVAL: requests.get_interval,
         **{command: partial(requests.send_now, message) for command, message in _LEGACY_REQUESTS.items()},
-        **other_commands(px4),
+        **dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED),
+        **dict.fromkeys(_UNANSWERED, lambda _: None),  # None sends no acknowledgement.
         **px4.camera_trigger.commands(),
         **gimbal_commands(px4.gimbal),
         Cmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
@@ -139,6 +126,14 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         Cmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),  # A reboot replaces `calibration`.
         Cmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         Cmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
+        Cmd.DO_LAND_START: lambda _: MavResult.CANCELLED,
+        Cmd.CONTROL_HIGH_LATENCY: lambda _: _refuse_high_latency(px4),
+        Cmd.INJECT_FAILURE: partial(_inject_failure, px4),
+        Cmd.LOGGING_START: px4.log_stream.start,
+        Cmd.LOGGING_STOP: px4.log_stream.stop,
+        Cmd.DO_GRIPPER: lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S),
+        Cmd.ACTUATOR_TEST: partial(_test_actuator, px4),
+        Cmd.PREFLIGHT_STORAGE: partial(_store, px4),
     }
 
 

@@ -1,30 +1,26 @@
-"""Measurements that a companion computer sends to a simulated PX4, and precision landing."""
+"""Measurements that a companion computer sends to a simulated PX4."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.mavlink.message import Message
+from aerokit.sim.autopilot import SimulatedAutopilot
+from aerokit.sim.channel import Channel
 from aerokit.sim.commands import ReceivedCommand
-from aerokit.sim.motion import GlobalPoint, velocity_to_landing_target
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.host import Px4Host
+from aerokit.sim.motion import GlobalPoint
 
 _SENSORS = (m.ObstacleDistance, m.DistanceSensor, m.OpticalFlowRad)
 _VISION_TIMEOUT_S = 5.0
-_MIN_TOLERANCE_M = 0.05
 _HORIZONTAL, _GPS_POSITION = 1, 1
 
 
 class Px4External:
     """Measurements of external sensors. Only vision and landing targets affect the vehicle."""
 
-    def __init__(self, px4: Px4Host) -> None:
+    def __init__(self, px4: SimulatedAutopilot) -> None:
         self._px4 = px4
         self.latest: dict[type[Message], Message] = {}
         self.clock_answers: int = 0
@@ -87,52 +83,3 @@ class Px4External:
         is_answer = message.tc1 != 0
         if is_answer:
             self.clock_answers += 1
-
-
-class PrecisionLanding:
-    """Precision landing: approaches the target from above, then descends.
-
-    If the target is lost, the vehicle climbs to PLD_SRCH_ALT to search for it, at most PLD_MAX_SRCH times.
-    """
-
-    def __init__(self, px4: Px4Host) -> None:
-        self._px4 = px4
-        self.enter()
-
-    def enter(self) -> None:
-        self._search_began_at: float | None = None  # None while the target is visible
-        self._search_count = 0
-        self._has_given_up = False
-
-    def update(self) -> None:
-        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
-        target = px4.external.target
-        # After too many or too long searches, the vehicle lands without the target, even if it becomes visible again.
-        if self._has_given_up:
-            px4.flight.descend()
-            return
-        if target is None:
-            self._search()
-            return
-        self._search_began_at = None
-        target_north, target_east = target
-        north, east = target_north - motion.north, target_east - motion.east
-        # The vehicle never is exactly above the target, so a minimum tolerance replaces a parameter of 0.
-        is_above = math.hypot(north, east) <= max(parameters["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
-        descent = px4.flight.descent_speed_m_s if is_above else 0.0
-        motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
-
-    def _search(self) -> None:
-        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
-        if self._search_began_at is None:
-            self._search_began_at = px4.now
-            self._search_count += 1
-        has_timed_out = px4.now - self._search_began_at > parameters["PLD_SRCH_TOUT"]
-        if has_timed_out or self._search_count > parameters["PLD_MAX_SRCH"]:
-            self._has_given_up = True
-            px4.flight.descend()
-            return
-        _, _, home_down = px4.home
-        search_down = home_down - parameters["PLD_SRCH_ALT"]
-        # Search from above: hold the place, and climb to the search altitude.
-        motion.seek_position(motion.north, motion.east, search_down, speed=1.0, climb=2.0, descent=1.0)

@@ -103,13 +103,11 @@ _BATTERY_TEXTS = {
 class Px4Failsafes:
     """Checks for failures five times a second and executes failsafe actions."""
 
-    battery_state: MavBatteryChargeState
-
     def __init__(self, px4: Px4Host, text_links: Px4TextLinks) -> None:
         self._px4, self._text_links = px4, text_links
         self.fence: Px4Fence = Px4Fence(px4)
         self.action: FailsafeAction = Action.NONE  # The action that is being executed.
-        self.battery_state = MavBatteryChargeState.OK
+        self.battery_state: MavBatteryChargeState = MavBatteryChargeState.OK
         """MAV_BATTERY_CHARGE_STATE, which never improves while the vehicle is armed."""
         self.has_station: bool = False  # True while heartbeats of a ground station are received.
         self._station_at = -math.inf  # time of the last heartbeat of a ground station

@@ -6,9 +6,8 @@ import math
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType
-from aerokit.sim.motion import BRAKING_SHARE, Ned, approach_speed
+from aerokit.sim.motion import BRAKING_SHARE, Ned, approach_speed, velocity_to_landing_target
 from aerokit.sim.px4 import modes
-from aerokit.sim.px4.external import PrecisionLanding
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.manual import Px4ManualFlight
 from aerokit.sim.px4.modes import Px4Mode
@@ -62,6 +61,58 @@ class Px4Orbit:
         return m.OrbitExecutionStatus(px4.time_boot_us, self.radius_m, MavFrame.GLOBAL, *place)
 
 
+_MIN_TOLERANCE_M = 0.05
+
+
+class PrecisionLanding:
+    """Precision landing: approaches the target from above, then descends.
+
+    If the target is lost, the vehicle climbs to PLD_SRCH_ALT to search for it, at most PLD_MAX_SRCH times.
+    """
+
+    def __init__(self, px4: Px4Host) -> None:
+        self._px4 = px4
+        self.enter()
+
+    def enter(self) -> None:
+        self._search_began_at: float | None = None  # None while the target is visible
+        self._search_count = 0
+        self._has_given_up = False
+
+    def update(self) -> None:
+        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
+        target = px4.external.target
+        # After too many or too long searches, the vehicle lands without the target, even if it becomes visible again.
+        if self._has_given_up:
+            px4.flight.descend()
+            return
+        if target is None:
+            self._search()
+            return
+        self._search_began_at = None
+        target_north, target_east = target
+        north, east = target_north - motion.north, target_east - motion.east
+        # The vehicle never is exactly above the target, so a minimum tolerance replaces a parameter of 0.
+        is_above = math.hypot(north, east) <= max(parameters["PLD_HACC_RAD"], _MIN_TOLERANCE_M)
+        descent = px4.flight.descent_speed_m_s if is_above else 0.0
+        motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
+
+    def _search(self) -> None:
+        px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
+        if self._search_began_at is None:
+            self._search_began_at = px4.now
+            self._search_count += 1
+        has_timed_out = px4.now - self._search_began_at > parameters["PLD_SRCH_TOUT"]
+        if has_timed_out or self._search_count > parameters["PLD_MAX_SRCH"]:
+            self._has_given_up = True
+            px4.flight.descend()
+            return
+        _, _, home_down = px4.home
+        search_down = home_down - parameters["PLD_SRCH_ALT"]
+        # Search from above: hold the place, and climb to the search altitude.
+        motion.seek_position(motion.north, motion.east, search_down, speed=1.0, climb=2.0, descent=1.0)
+
+
 # Values of RTL_TYPE.
 _NEAREST, _RALLY_FIRST = (0, 3), 1
 
@@ -90,7 +141,7 @@ class Px4Flight:
         self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL, which is home or a rally point.
         self.heading: float | None = None  # Heading in radians; None if the nose points in the direction of flight.
         self.speed_m_s: float = 0.0
-        self.radius_m: float = 0.0  # Radius of the circle that a plane flies.
+        self.radius_m: float = 0.0  # Radius of a plane's circle; a negative radius is counter-clockwise.
         self.lifts_off: bool = False  # True if the mode makes the vehicle leave the ground.
         self.manual_flight: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)

@@ -1,19 +1,24 @@
-"""Interfaces between the modules of a simulated PX4.
+"""State, modes and land detector of a simulated PX4, and the interfaces of its modules.
 
-`Px4Host` declares the vehicle, and the protocols declare its modules. The modules use these interfaces because they
-cannot import `Px4Vehicle`, which imports the modules.
+The modules use `Px4Host` and each other's interfaces. They cannot import `Px4Vehicle`, which imports the modules.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
-from aerokit.mavlink.enums import MavFrame
+from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions import MissionItem
 from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.motion import Ned
+from aerokit.sim.px4 import modes
+from aerokit.sim.px4.external import Px4External
 from aerokit.sim.px4.modes import Px4Mode
+
+_LAND_DETECTOR_S = 1.0
+_MODES_ENDED_BY_LANDING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_LAND, modes.RTL})
 
 
 class Px4SticksInterface(Protocol):
@@ -48,29 +53,38 @@ class Px4FailsafesInterface(Protocol):
     @property
     def acts(self) -> bool: ...
     def arming_obstacles(self) -> list[str]: ...
+    def can_be_overridden(self, moved: float) -> bool: ...
+    def on_armed(self) -> None: ...
+    def override(self) -> None: ...
 
 
 class Px4FlightInterface(Protocol):
     target: Ned
     heading: float | None
     speed_m_s: float
+    lifts_off: bool
 
     @property
     def descent_speed_m_s(self) -> float: ...
     @property
     def top_speed_m_s(self) -> float: ...
+    def enter(self, mode: Px4Mode) -> None: ...
     def stay_here(self) -> None: ...
+    def plan_take_off(self, down: float | None = None) -> None: ...
+    def announce_take_off(self) -> None: ...
     def fly_to_target(self) -> None: ...
     def descend(self) -> None: ...
 
 
 class Px4MissionInterface(Protocol):
     current: int
+    is_valid: bool
 
     @property
     def wants_up(self) -> bool: ...
     def enter(self) -> None: ...
     def update(self) -> None: ...
+    def on_landed(self) -> None: ...
     def on_replaced(self, current: int) -> None: ...
     def forget_reached(self) -> None: ...
     def set_current(self, seq: int) -> None: ...
@@ -86,28 +100,19 @@ class Px4MissionsInterface(Protocol):
 
 class Px4OffboardInterface(Protocol):
     @property
+    def is_fresh(self) -> bool: ...
+    @property
     def wants_up(self) -> bool: ...
     def fly(self) -> None: ...
 
 
-class Px4ExternalInterface(Protocol):
-    @property
-    def target(self) -> tuple[float, float] | None: ...
-
-
 class Px4Host(SimulatedAutopilot):
-    """A simulated PX4 as its modules see it. `Px4Vehicle` implements this interface."""
+    """A simulated PX4 as its modules see it: its state and modes. `Px4Vehicle` adds the modules."""
 
     VEHICLE_TYPE: ClassVar[int]
 
     home: Ned
-    mode: Px4Mode
-    intended_mode: Px4Mode
-    mode_after_landing: Px4Mode
-    is_ready: bool
-    is_armed: bool
-    is_landed: bool
-    is_in_failsafe: bool
+    boot_time_s: float
     sticks: Px4SticksInterface
     arming: Px4ArmingInterface
     failsafes: Px4FailsafesInterface
@@ -115,7 +120,23 @@ class Px4Host(SimulatedAutopilot):
     mission: Px4MissionInterface
     missions: Px4MissionsInterface
     offboard: Px4OffboardInterface
-    external: Px4ExternalInterface
+    external: Px4External
+
+    def _reset_state(self) -> None:
+        """Set the state after a power-on: disarmed and landed, in HOLD."""
+        self.is_ready: bool = False
+        self.is_armed: bool = False
+        self.is_landed: bool = True
+        self.mode: Px4Mode = modes.HOLD
+        self.intended_mode: Px4Mode = modes.HOLD
+        self.is_in_failsafe: bool = False
+        self.throttle: float = 0.0
+        # True if a client has set home. Otherwise, arming sets home to the position of the vehicle.
+        self.home_is_set_by_client: bool = False
+        self.mode_after_landing: Px4Mode = modes.HOLD
+        self._touchdown_at = math.nan  # NaN while the vehicle does not touch the ground
+        self._landed_at = math.nan  # when the landing was detected; NaN before
+        self._has_flown = False  # True after a take-off, until the vehicle is armed again
 
     @property
     def altitude_m(self) -> float:
@@ -133,29 +154,117 @@ class Px4Host(SimulatedAutopilot):
 
     @property
     def has_position(self) -> bool:
-        raise NotImplementedError
+        """True if the estimator has a global position."""
+        has_global = self.external.has_gps or (self.external.has_vision and self.has_origin)
+        return self.uptime >= 0.5 * self.boot_time_s and has_global
 
-    def can_run(self, mode: Px4Mode) -> bool:
-        raise NotImplementedError
-
-    def change_mode(self, mode: Px4Mode) -> bool:
-        raise NotImplementedError
-
-    def switch_to(self, mode: Px4Mode) -> None:
-        raise NotImplementedError
-
-    def leave_ground(self) -> None:
-        """Called when the vehicle takes off."""
-        raise NotImplementedError
+    @property
+    def has_origin(self) -> bool:
+        """True if the local frame has a global origin."""
+        return self.external.has_gps or self.external.origin is not None
 
     def on_armed(self) -> None:
-        """Called after arming."""
-        raise NotImplementedError
+        """Start the mode that was entered while disarmed, and set home."""
+        self.is_armed = True
+        self._has_flown = False
+        self._landed_at = math.nan
+        if not self.home_is_set_by_client:
+            self.home = self.motion.place
+        self.failsafes.on_armed()
+        # MISSION and TAKEOFF may have been entered while disarmed. They start when the vehicle is armed.
+        if self.mode == modes.MISSION:
+            self.mission.enter()
+        elif self.mode == modes.TAKEOFF:
+            self.flight.announce_take_off()
+        self.set_ticking(True)
 
     def on_disarmed(self) -> None:
-        """Called after disarming."""
-        raise NotImplementedError
+        self.is_armed = False
+        self.throttle = 0.0
+        self.is_in_failsafe = False
+
+    def terminate(self) -> None:
+        """Stop the motors until a restart."""
+        self.arming.terminate()
+        self.switch_to(modes.TERMINATION)
+
+    def change_mode(self, mode: Px4Mode) -> bool:
+        """Handle a mode request. Return False if an armed vehicle cannot run the mode. LAND is never refused."""
+        if self.is_armed and mode != modes.LAND and not self.can_run(mode):
+            return False
+        if mode not in _MODES_ENDED_BY_LANDING:
+            self.mode_after_landing = mode
+        self.is_in_failsafe = False
+        self.intended_mode = mode
+        self.failsafes.override()
+        # A request for the present mode restarts MISSION. In any other mode, the vehicle stays at its present position.
+        if mode == self.mode == modes.MISSION:
+            self.mission.enter()
+        elif mode == self.mode:
+            self.flight.stay_here()
+        else:
+            self.switch_to(mode)
+        if mode == modes.TAKEOFF:
+            self.flight.plan_take_off()
+        return True
+
+    def can_run(self, mode: Px4Mode) -> bool:
+        """Return True if everything the mode needs is available.
+
+        Depending on the mode, these are stick input, a valid mission, set-points, and a position estimate.
+        """
+        traits = modes.MODES.get(mode)
+        if traits is None or self.arming.is_terminated:
+            return False
+        if mode == modes.MISSION and not self.mission.is_valid:
+            return False
+        if mode == modes.OFFBOARD and not self.offboard.is_fresh:
+            return False
+        if traits.needs_sticks and not self.sticks.are_fresh:
+            return False
+        return self.has_position or not traits.needs_position
+
+    def switch_to(self, mode: Px4Mode) -> None:
+        """Change the mode, which the next heartbeat reports."""
+        self.mode = mode
+        self.flight.enter(mode)
+        if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle about a return.
+            all_components = 0
+            self.send_command((self.system_id, all_components), MavCmd.NAV_RETURN_TO_LAUNCH)
+
+    def leave_ground(self) -> None:
+        self.is_landed = False
+        self._has_flown = True
+        self._touchdown_at = math.nan
+        self.info("Takeoff detected")
 
     def on_sticks_moved(self, distance: float) -> None:
-        """Called with the distance by which a stick has moved. 2 is the distance from end to end."""
-        raise NotImplementedError
+        """Switch to POSITION if the sticks moved far enough and the present mode can be overridden."""
+        if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(distance):
+            self.info("Pilot took over using sticks")
+            self.change_mode(modes.POSITION)
+
+    def _has_touched_down(self) -> bool:
+        return self.motion.is_on_ground
+
+    def _detect_landing(self) -> None:
+        is_lifting_off = self.is_armed and self.flight.lifts_off
+        if not self._has_touched_down() or is_lifting_off or self.arming.is_terminated:
+            self._touchdown_at = math.nan
+        elif math.isnan(self._touchdown_at):
+            self._touchdown_at = self.now
+        elif self.now - self._touchdown_at >= _LAND_DETECTOR_S or not self.is_armed:
+            self.is_landed = True
+            self._landed_at = self.now
+            self.motion.settle()
+            self.info("Landing detected")
+            self.mission.on_landed()
+
+    def _auto_disarm(self) -> None:
+        if not self.is_armed or not self.is_landed or self.flight.lifts_off:
+            return
+        if self._has_flown:
+            if 0 < self.parameters["COM_DISARM_LAND"] <= self.now - self._landed_at:
+                self.arming.disarm("landing")
+        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.armed_at:
+            self.arming.disarm("auto preflight disarming")

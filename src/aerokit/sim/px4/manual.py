@@ -163,12 +163,9 @@ class Px4ManualFlight:
         """Return the vertical velocity in m/s (down) that the throttle stick commands."""
         px4, motion = self._px4, self._px4.motion
         throttle = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
-        if throttle > 0:
+        if throttle:
             self._down = None
-            return -throttle * px4.parameters["MPC_Z_VEL_MAX_UP"]
-        if throttle < 0:
-            self._down = None
-            return -throttle * px4.parameters["MPC_Z_VEL_MAX_DN"]
+            return -throttle * px4.parameters["MPC_Z_VEL_MAX_UP" if throttle > 0 else "MPC_Z_VEL_MAX_DN"]
         if self._down is None:
             if abs(motion.velocity_down) > _AT_REST_M_S:  # First stop, then hold the height of the stop.
                 return 0.0

@@ -230,11 +230,9 @@ class Px4CameraTrigger:
     As on the real vehicle, commands are not answered if no trigger is fitted.
     """
 
-    sequence: int
-
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self.sequence = 0  # Sequence number of the next image.
+        self.sequence: int = 0  # Sequence number of the next image.
         self.interval_s: float = 1.0  # Seconds between two images of a series.
         self.sends_image_captured = True  # False simulates a PX4 without the geotag module.
         self._is_enabled = False

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from aerokit.errors import RemoteProtocolError
-from aerokit.mavlink.enums import MavParamType, MavSeverity
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavParamType, MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat, LogEntry, LogRequestData, LogRequestList
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
 from aerokit.protocols.ftp import DATA_SIZE
-from aerokit.protocols.servers.files import EINVAL, FileFault, FileHandle, FileTree
-from aerokit.protocols.servers.ftp import SessionFtpServer
+from aerokit.protocols.servers.files import EEXIST, EINVAL, FileFault, FileHandle, FileTree
+from aerokit.protocols.servers.ftp import ServedClient, SessionFtpServer
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 from aerokit.sim.autopilot import VehicleSigning, VehicleStorage
 from aerokit.sim.channel import Channel
 from aerokit.sim.logs import BLOCK_SIZE, LogServer, SimulatedLog
 from aerokit.sim.parameter_server import ParameterServer, Px4ParameterServer
 from aerokit.sim.parameters import ParameterPackMount, SimParameters
-from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
+from aerokit.sim.vehicle import MessageHost
 
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
@@ -124,6 +125,57 @@ class _Writer(FileHandle):
         self._previous_name = entry.name
         self._count += 1
         return True
+
+
+class Px4Ftp(SessionFtpServer[FileTree]):
+    """MAVFTP server of PX4. Each link has one session (number 0), which ends after 10 s without a request.
+
+    A burst ignores the requested size. After a failure, the next refusals may report its errno, until the client has
+    listed a directory. `Faults.no_ftp` turns the server off.
+    """
+
+    max_clients: ClassVar[int] = 1 << 16
+    max_sessions: ClassVar[int] = 1
+    list_prefix: ClassVar[tuple[bytes, ...]] = (b"S", b"S")
+    crc_block: ClassVar[int] = 256
+    crc_blocks_at_once: ClassVar[int] = 1 << 32
+
+    def __init__(self, vehicle: MessageHost, files: FileTree) -> None:
+        super().__init__(vehicle, files, is_enabled=lambda: not vehicle.faults.no_ftp)
+
+    def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
+        return channel
+
+    def _is_repeated(self, client: ServedClient, request: FtpPacket, reply: FtpPacket) -> bool:
+        return request.sequence + 1 == reply.sequence and request.client == reply.client
+
+    def _new_number(self, client: ServedClient, request: FtpPacket) -> int:
+        return 0
+
+    def _answer_fault(self, client: ServedClient, request: FtpPacket, fault: FileFault) -> FtpPacket:
+        if request.opcode in (MavFtpOpcode.TRUNCATEFILE, MavFtpOpcode.CALCFILECRC):
+            return request.refuse_errno(client.errno)  # The firmware reports the errno of an earlier failure.
+        client.errno = fault.errno
+        if request.opcode == MavFtpOpcode.LISTDIRECTORY:
+            return request.refuse(MavFtpErr.FILENOTFOUND)
+        return request.refuse_errno(fault.errno)
+
+    def _adapted(self, client: ServedClient, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
+        if answer.opcode == MavFtpOpcode.NAK and client.errno == EEXIST:
+            answer = request.refuse(MavFtpErr.FILEEXISTS)
+        return super()._adapted(client, request, answer)
+
+    def _list(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        answer = super()._list(client, request)
+        client.errno = 0
+        return answer
+
+    def _rename(self, client: ServedClient, request: FtpPacket) -> FtpPacket:
+        old_name, _, _ = request.data[: request.size].partition(b"\0")
+        has_new_name = len(old_name) + 2 < request.size
+        if not has_new_name:
+            return request.refuse_errno(client.errno)  # The firmware reports the errno of an earlier failure.
+        return super()._rename(client, request)
 
 
 class Px4LogServer(LogServer):

@@ -318,7 +318,7 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.CurrentMode.ID: lambda px4: m.CurrentMode(
         _STANDARD.get(px4.mode, 0), modes.custom_mode(px4.mode), modes.custom_mode(px4.intended_mode)
     ),
-    m.Ping.ID: lambda px4: m.Ping(px4.time_boot_us, px4.next_ping(), target_system=0, target_component=0),
+    m.Ping.ID: lambda px4: m.Ping(px4.time_boot_us, next(px4.ping_numbers), target_system=0, target_component=0),
     m.CurrentEventSequence.ID: lambda px4: px4.events.current(),
     **SENSOR_BUILDERS,
     **IDENTITY_BUILDERS,

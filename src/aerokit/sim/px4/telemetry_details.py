@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import (
     StorageStatus,
 )
 from aerokit.mavlink.message import Message
+from aerokit.sim.commands import rotated
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.modes import ORBIT
@@ -135,12 +136,8 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
 def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     """Return the measured acceleration in m/s² forward, right and down."""
     motion = px4.motion
-    # At rest, accelerometers measure the force of the ground: 1 g upwards.
-    north, east = motion.acceleration_north, motion.acceleration_east
-    down = motion.acceleration_down - GRAVITY_M_S2
-    cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
-    forward = north * cos_yaw + east * sin_yaw
-    right = east * cos_yaw - north * sin_yaw
+    forward, right, down = rotated(motion.acceleration, -motion.yaw)
+    down -= GRAVITY_M_S2  # At rest, accelerometers measure the force of the ground: 1 g upwards.
     # Terms with sin(roll) * sin(pitch) or the like are small, and are left out.
     return (
         forward * math.cos(motion.pitch) - down * math.sin(motion.pitch),

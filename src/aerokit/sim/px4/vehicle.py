@@ -83,10 +83,9 @@ class Px4PlaneFlight(Px4Flight):
 
     _vehicle: SimulatedPx4Plane  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
+    def __init__(self, plane: SimulatedPx4Plane) -> None:
         super().__init__(plane)
-        self._motion = motion
-        self.radius_m: float = 0.0  # Radius of the circle; a negative radius is counter-clockwise.
+        self._motion = plane.motion
         self.course: float = 0.0  # Course of the climb after take-off, in radians.
 
     @property
@@ -105,7 +104,7 @@ class Px4PlaneFlight(Px4Flight):
         )
 
     def enter(self, mode: Px4Mode) -> None:
-        self.radius_m = self._vehicle.parameters["NAV_LOITER_RAD"]
+        self.radius_m: float = self._vehicle.parameters["NAV_LOITER_RAD"]
         self.course = self._motion.yaw
         super().enter(mode)
 
@@ -317,6 +316,8 @@ class SimulatedPx4Plane(SimulatedPx4):
 
     VEHICLE_TYPE: ClassVar[int] = MavType.FIXED_WING
     PARAMETER_TABLE: ClassVar[str] = "airplane"
+    FLIGHT: ClassVar[type[Px4Flight]] = Px4PlaneFlight
+    MISSION: ClassVar[type[Px4Mission]] = Px4PlaneMission
 
     flight: Px4PlaneFlight  # pyright: ignore[reportIncompatibleVariableOverride]
     motion: FixedWing  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -334,12 +335,6 @@ class SimulatedPx4Plane(SimulatedPx4):
             sink_m_s=values["FW_T_SINK_MAX"],
         )
         return FixedWing(self.rng, wing, wind)
-
-    def _make_flight(self) -> Px4Flight:
-        return Px4PlaneFlight(self, self.motion)
-
-    def _make_mission(self) -> Px4Mission:
-        return Px4PlaneMission(self)
 
     def _is_moving(self) -> bool:
         return super()._is_moving() or self.flight.is_rolling
