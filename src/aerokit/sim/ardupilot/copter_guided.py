@@ -9,12 +9,21 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import CopterMode, MavFrame
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase, CopterTakeOff
+from aerokit.sim.ardupilot.host import GuidedMode
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import PositionTarget, Setpoint, constrained, is_finite, rotated
 from aerokit.sim.motion import Ned, euler_from_quaternion
 
 _ZERO: Ned = (0.0, 0.0, 0.0)
 _UNIT_LENGTH_TOLERANCE = 1e-3
+
+
+_BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
+_LOCAL = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED}) | _BODY
+_ALL_RATES = (
+    AttitudeMask.BODY_ROLL_RATE_IGNORE | AttitudeMask.BODY_PITCH_RATE_IGNORE | AttitudeMask.BODY_YAW_RATE_IGNORE
+)
+_MAX_VELOCITY_M_S = 1000.0
 
 
 class GuidedSubmode(Enum):
@@ -28,11 +37,11 @@ class GuidedSubmode(Enum):
     ATTITUDE = "attitude"
 
 
-class CopterGuided(CopterModeBase):
+class CopterGuided(CopterModeBase, GuidedMode):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
     DO_CHANGE_SPEED sets a speed limit. When the type of target changes (position, velocity, acceleration), the limits
-    are WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN again, as in ArduCopter.
+    are WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN again, as in ArduCopter. An invalid set-point stops the copter.
     """
 
     number: int = CopterMode.GUIDED
@@ -210,49 +219,23 @@ class CopterGuided(CopterModeBase):
         down = max(-self.climb, min(self.descent, down))
         self.vehicle.motion.follow_trajectory((north, east, down), acceleration)
 
-
-_BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
-_LOCAL = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED}) | _BODY
-_ALL_RATES = (
-    AttitudeMask.BODY_ROLL_RATE_IGNORE | AttitudeMask.BODY_PITCH_RATE_IGNORE | AttitudeMask.BODY_YAW_RATE_IGNORE
-)
-_MAX_VELOCITY_M_S = 1000.0
-
-
-class CopterSetpoints:
-    """Handlers of the set-point messages. As in the firmware, an invalid message in GUIDED stops the vehicle."""
-
-    def __init__(self, copter: CopterHost) -> None:
-        self._copter = copter
-        copter.on(SetPositionTargetLocalNed, self._on_local)
-        copter.on(SetPositionTargetGlobalInt, self._on_global)
-        copter.on(SetAttitudeTarget, self._on_attitude)
-
-    @property
-    def _guided(self) -> CopterGuided:
-        return self._copter.mode_of(CopterGuided)
-
-    @property
-    def _is_guided(self) -> bool:
-        return self._copter.mode is self._guided
-
-    def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
-        if not self._is_guided:
+    def on_local_target(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
+        if not self.is_active:
             return
         frame = target.coordinate_frame
-        point = self._copter.local_point(target, _BODY)
+        point = self.vehicle.local_point(target, _BODY)
         if frame not in _LOCAL or not self._follow(target, point, rotate=frame in _BODY):
-            self._guided.enter(force=False)  # An invalid message stops the vehicle.
+            self.enter(force=False)  # An invalid message stops the vehicle.
 
-    def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
-        if not self._is_guided:
+    def on_global_target(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        if not self.is_active:
             return
-        point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
+        point = self.vehicle.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_position_missing = point is None and Setpoint.of(target).has_position
         # If the message has no position, `_follow` ignores its argument `point`.
         is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
         if not is_followed:
-            self._guided.enter(force=False)  # An invalid message stops the vehicle.
+            self.enter(force=False)  # An invalid message stops the vehicle.
 
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
         """Follow a set-point. Return False if it is invalid.
@@ -260,7 +243,7 @@ class CopterSetpoints:
         ``point`` is the position in the world frame. With ``rotate``, velocity, acceleration and yaw are in the body
         frame.
         """
-        setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
+        setpoint, motion, yaw = Setpoint.of(target), self.vehicle.motion, self.vehicle.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None
         acceleration = setpoint.acceleration if setpoint.has_acceleration else None
         is_velocity_valid = all(abs(part) <= _MAX_VELOCITY_M_S for part in velocity or _ZERO)
@@ -270,7 +253,7 @@ class CopterSetpoints:
             velocity = None if velocity is None else rotated(velocity, motion.yaw)
             acceleration = None if acceleration is None else rotated(acceleration, motion.yaw)
         position = point if setpoint.has_position else None
-        if not self._guided.set_target(position, velocity, acceleration):
+        if not self.set_target(position, velocity, acceleration):
             return False
         if setpoint.yaw is not None:
             yaw.turn_to(setpoint.yaw + (motion.yaw if rotate else 0.0))  # In a body frame, yaw is relative to the nose.
@@ -280,8 +263,8 @@ class CopterSetpoints:
             yaw.apply_default()
         return True
 
-    def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
-        copter, mask = self._copter, target.type_mask
+    def on_attitude_target(self, target: SetAttitudeTarget, _: Channel) -> None:
+        copter, mask = self.vehicle, target.type_mask
         guided = copter.mode
         if not isinstance(guided, CopterGuided):
             return

@@ -86,13 +86,30 @@ class ArduPilotMode:
     def resume(self) -> bool:
         return False
 
-    def go_to(self, position: Ned) -> None:
-        """Go to a point of the world frame and stay there. Only the guided mode implements this method."""
-        raise NotImplementedError
-
     @property
     def destination(self) -> Ned | None:
         return None
+
+
+class GuidedMode(ArduPilotMode):
+    """Base of the modes GUIDED, which follow set-points. The vehicle registers the handlers of set-point messages."""
+
+    @property
+    def is_active(self) -> bool:
+        return self.vehicle.mode is self
+
+    def go_to(self, position: Ned) -> None:
+        """Go to a point of the world frame and stay there."""
+        raise NotImplementedError
+
+    def on_local_target(self, message: m.SetPositionTargetLocalNed, _: Channel, /) -> None:
+        raise NotImplementedError
+
+    def on_global_target(self, message: m.SetPositionTargetGlobalInt, _: Channel, /) -> None:
+        raise NotImplementedError
+
+    def on_attitude_target(self, message: m.SetAttitudeTarget, _: Channel, /) -> None:
+        raise NotImplementedError
 
 
 def variant(
@@ -283,7 +300,7 @@ class ArduPilotHost(SimulatedAutopilot):
     rc: ArduPilotRadioHost
 
     @property
-    def guided(self) -> ArduPilotMode:
+    def guided(self) -> GuidedMode:
         raise NotImplementedError
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 from aerokit.mavlink.enums import (
     MavCmd,
@@ -18,14 +18,12 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.sim.ardupilot import plane_modes as modes
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
-from aerokit.sim.ardupilot.fence import ArduPilotFence
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, variant
-from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided, PlaneSetpoints, guided_commands
+from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided
 from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneModeBase, PlaneNavigatingMode
-from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 
 _SHORT_DISABLED = 3
@@ -107,19 +105,18 @@ class SimulatedPlane(PlaneHost):
     rotors, parachutes.
     """
 
-    KIND: ClassVar[Kind] = "plane"
-    FIRMWARE: ClassVar[str] = "ArduPlane"
-    MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
-    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
-    BASE_FLAGS: ClassVar[int] = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
-    CAPABILITIES: ClassVar[int] = 0xF36F
-    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
-    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
-    ARMING: ClassVar[type[ArduPilotArming[Any]]] = PlaneArming
-    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = PlaneFailsafes
-    FENCE: ClassVar[type[ArduPilotFence[Any]]] = PlaneFence
-    MOTORS: ClassVar[type[ArduPilotMotors]] = PlaneEngine
-    SETPOINTS: ClassVar[type[Any]] = PlaneSetpoints
+    KIND = "plane"
+    FIRMWARE = "ArduPlane"
+    MAV_TYPE = MavType.FIXED_WING
+    HOME_NEEDS_ORIGIN = False
+    BASE_FLAGS = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
+    CAPABILITIES = 0xF36F
+    BUILDERS = BUILDERS_OF_KIND["plane"]
+    MODES = _MODES
+    ARMING = PlaneArming
+    FAILSAFES = PlaneFailsafes
+    FENCE = PlaneFence
+    MOTORS = PlaneEngine
 
     fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -135,7 +132,11 @@ class SimulatedPlane(PlaneHost):
             MavCmd.MISSION_START: self._start_mission,
             MavCmd.DO_REPOSITION: self._reposition,
             MavCmd.DO_CHANGE_SPEED: self._change_speed,
-            **guided_commands(self),
+            **dict.fromkeys(
+                (MavCmd.GUIDED_CHANGE_SPEED, MavCmd.GUIDED_CHANGE_ALTITUDE, MavCmd.GUIDED_CHANGE_HEADING),
+                lambda command: self.guided.on_guided_command(command),
+            ),
+            MavCmd.DO_CHANGE_ALTITUDE: lambda command: self.guided.change_target_altitude(command),
             MavCmd.DO_FLIGHTTERMINATION: self._terminate,
         }
 

@@ -16,11 +16,11 @@ from aerokit.mavlink.enums import HeadingType, MavFrame, MavResult, MavSeverity,
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES
+from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES, GuidedMode
 from aerokit.sim.ardupilot.mission_run import MissionMode, set_home_from
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, to_int
+from aerokit.sim.commands import ReceivedCommand, constrained, to_int
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
@@ -239,11 +239,11 @@ class _TimedValue:
     received_at: float
 
 
-class PlaneGuided(PlaneNavigatingMode):
+class PlaneGuided(PlaneNavigatingMode, GuidedMode):
     """GUIDED: flies to the target and circles there.
 
     A commanded course is valid until it is cancelled or the next target arrives. Bank, pitch and throttle of
-    SET_ATTITUDE_TARGET expire after three seconds each.
+    SET_ATTITUDE_TARGET expire after three seconds each. ArduPlane uses only the altitude of position targets.
     """
 
     number: int = PlaneMode.GUIDED
@@ -252,7 +252,7 @@ class PlaneGuided(PlaneNavigatingMode):
 
     def enter(self, *, force: bool) -> bool:
         self._climb_limit = _UNLIMITED_M_S
-        self._course: float | None = None
+        self._course: float | None = None  # course to fly in radians from north; None to fly to the target
         self._bank = self._pitch = self._throttle = _TimedValue(0.0, -math.inf)
         return super().enter(force=force)
 
@@ -267,11 +267,9 @@ class PlaneGuided(PlaneNavigatingMode):
             self._place = (north, east, down)
             self._climb_limit = climb_m_s
 
-    def change_course(self, course: float | None) -> None:
-        """Fly on a course in radians from north. With None, the plane circles again."""
-        self._course = course
-
-    def set_attitude(self, message: m.SetAttitudeTarget) -> None:
+    def on_attitude_target(self, message: m.SetAttitudeTarget, _channel: Channel) -> None:
+        if not self.is_active:
+            return
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
         # If the message gives an attitude without rates, the firmware uses both angles. Otherwise, it uses each angle
@@ -306,37 +304,19 @@ class PlaneGuided(PlaneNavigatingMode):
         bank = max(-limits.bank_rad, min(limits.bank_rad, self._bank.value)) if has_bank else 0.0
         wing.bank_and_climb(speed, bank, climb)
 
-
-class PlaneSetpoints:
-    """Handlers of set-point messages in GUIDED. ArduPlane uses only the altitude of position targets."""
-
-    def __init__(self, plane: PlaneHost) -> None:
-        self._plane = plane
-        plane.on(m.SetPositionTargetLocalNed, self._on_local)
-        plane.on(m.SetPositionTargetGlobalInt, self._on_global)
-        plane.on(m.SetAttitudeTarget, self._on_attitude)
-
-    @property
-    def _guided(self) -> PlaneGuided:
-        return self._plane.mode_of(PlaneGuided)
-
-    @property
-    def _is_guided(self) -> bool:
-        return self._plane.mode is self._guided
-
-    def _on_local(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
-        plane, target = self._plane, self._guided.destination
-        if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
+    def on_local_target(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
+        plane, target = self.vehicle, self.destination
+        if not self.is_active or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
             return
         _north, _east, target_down = target
         _north, _east, home_down = plane.home_or_ground
         down = target_down + message.z
-        self._guided.change_altitude(down)
+        self.change_altitude(down)
         plane.info(f"Change alt to {home_down - down:.1f}")
 
-    def _on_global(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
-        plane = self._plane
-        if not self._is_guided:
+    def on_global_target(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
+        plane = self.vehicle
+        if not self.is_active:
             return
         point = plane.world_point(0, 0, message.alt, message.coordinate_frame)  # Only the altitude is used.
         if point is None:
@@ -344,67 +324,51 @@ class PlaneSetpoints:
             plane.send_text(MavSeverity.WARNING, text)
         elif not message.type_mask & PositionMask.Z_IGNORE:
             _north, _east, down = point
-            self._guided.change_altitude(down)
+            self.change_altitude(down)
 
-    def _on_attitude(self, message: m.SetAttitudeTarget, _: Channel) -> None:
-        if self._is_guided:
-            self._guided.set_attitude(message)
+    def on_guided_command(self, command: ReceivedCommand) -> int:
+        """Execute a command that only GUIDED accepts."""
+        handlers = {
+            Cmd.GUIDED_CHANGE_SPEED: self._change_speed,
+            Cmd.GUIDED_CHANGE_ALTITUDE: self._change_altitude,
+            Cmd.GUIDED_CHANGE_HEADING: self._change_heading,
+        }
+        return handlers[Cmd(command.command)](command) if self.is_active else MavResult.FAILED
 
+    def _change_speed(self, command: ReceivedCommand) -> int:
+        if to_int(command.param1) != SpeedType.AIRSPEED:
+            return MavResult.DENIED
+        if not self.vehicle.is_valid_airspeed(command.param2):
+            return MavResult.FAILED
+        self.speed: float = command.param2
+        return MavResult.ACCEPTED
 
-def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
-    def in_guided(handler: Callable[[PlaneHost, PlaneGuided, ReceivedCommand], int]) -> CommandHandler:
-        def handle(command: ReceivedCommand) -> int:
-            guided = plane.mode_of(PlaneGuided)
-            return handler(plane, guided, command) if plane.mode is guided else MavResult.FAILED
-
-        return handle
-
-    return {
-        Cmd.GUIDED_CHANGE_SPEED: in_guided(_change_speed),
-        Cmd.GUIDED_CHANGE_ALTITUDE: in_guided(_change_altitude),
-        Cmd.GUIDED_CHANGE_HEADING: in_guided(_change_heading),
-        Cmd.DO_CHANGE_ALTITUDE: lambda command: _change_target_altitude(plane, command),
-    }
-
-
-def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    if to_int(command.param1) != SpeedType.AIRSPEED:
-        return MavResult.DENIED
-    if not plane.is_valid_airspeed(command.param2):
-        return MavResult.FAILED
-    guided.speed = command.param2
-    return MavResult.ACCEPTED
-
-
-def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    point = plane.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
-    if command.z in _INVALID_ALTITUDES or point is None:
-        return MavResult.DENIED
-    _, _, down = point
-    # Param 3 is the climb rate in m/s. 0 selects the maximum.
-    guided.change_altitude(down, abs(command.param3) or _UNLIMITED_M_S)
-    return MavResult.ACCEPTED
-
-
-def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    if not 0.0 <= command.param2 < 360.0:
-        return MavResult.DENIED
-    if command.param1 == HeadingType.DEFAULT:
-        guided.change_course(None)
-    elif command.param1 in (HeadingType.COURSE_OVER_GROUND, HeadingType.HEADING):
-        guided.change_course(math.radians(command.param2))
-    else:
-        return MavResult.DENIED
-    return MavResult.ACCEPTED
-
-
-def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
-    point = plane.world_point(0, 0, command.param1, to_int(command.param2))  # Only the altitude is used.
-    if point is None:
-        return MavResult.DENIED
-    guided = plane.mode_of(PlaneGuided)
-    # Only GUIDED uses the altitude. All modes accept the command.
-    if plane.mode is guided:
+    def _change_altitude(self, command: ReceivedCommand) -> int:
+        point = self.vehicle.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
+        if command.z in _INVALID_ALTITUDES or point is None:
+            return MavResult.DENIED
         _, _, down = point
-        guided.change_altitude(down)
-    return MavResult.ACCEPTED
+        # Param 3 is the climb rate in m/s. 0 selects the maximum.
+        self.change_altitude(down, abs(command.param3) or _UNLIMITED_M_S)
+        return MavResult.ACCEPTED
+
+    def _change_heading(self, command: ReceivedCommand) -> int:
+        if not 0.0 <= command.param2 < 360.0:
+            return MavResult.DENIED
+        if command.param1 == HeadingType.DEFAULT:
+            self._course = None  # The plane circles again.
+        elif command.param1 in (HeadingType.COURSE_OVER_GROUND, HeadingType.HEADING):
+            self._course = math.radians(command.param2)
+        else:
+            return MavResult.DENIED
+        return MavResult.ACCEPTED
+
+    def change_target_altitude(self, command: ReceivedCommand) -> int:
+        """Execute DO_CHANGE_ALTITUDE. All modes accept the command, but only GUIDED uses the altitude."""
+        point = self.vehicle.world_point(0, 0, command.param1, to_int(command.param2))  # Only the altitude is used.
+        if point is None:
+            return MavResult.DENIED
+        if self.is_active:
+            _, _, down = point
+            self.change_altitude(down)
+        return MavResult.ACCEPTED

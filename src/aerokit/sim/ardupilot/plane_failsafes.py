@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavMissionType, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.failsafes import ArduPilotFailsafes
@@ -44,7 +43,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     termination.
     """
 
-    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
+    BATTERY_PRIORITIES = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -238,7 +237,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     previous mode.
     """
 
-    CIRCLE_BACKUP_M: ClassVar[float] = 100.0
+    CIRCLE_BACKUP_M = 100.0
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)

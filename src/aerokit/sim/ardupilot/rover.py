@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
 
-from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import FenceMitigate, MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, RoverMode
-from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors, ConditionTimer
-from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.radio import ArduPilotJoystick, RoverJoystick
+from aerokit.sim.ardupilot.radio import RoverJoystick
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverGuided, RoverHost
-from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
-from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
-from aerokit.sim.commands import CommandHandler, PositionTarget
-from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
+from aerokit.sim.commands import CommandHandler
+from aerokit.sim.motion import SimulatedWind
 from aerokit.sim.vehicle_motion import GroundLimits, GroundMotion
 
 _NEEDS_LOCATION = 1
@@ -92,7 +87,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     text is "Radio Failsafe", even if only the ground station is lost.
     """
 
-    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
+    BATTERY_PRIORITIES = (
         _TERMINATE, _HOLD, _RTL, _SMART_RTL_OR_HOLD, _SMART_RTL, _NONE,
     )  # fmt: skip
 
@@ -213,8 +208,8 @@ class RoverFence(ArduPilotFence[RoverHost]):
     FENCE_ACTION has the values of FS_ACTION. With any action but 0, a rover more than 100 m outside changes to HOLD.
     """
 
-    PERIOD_S: ClassVar[float] = 0.1
-    MITIGATION: ClassVar[int] = FenceMitigate.NONE
+    PERIOD_S = 0.1
+    MITIGATION = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
         vehicle = self.vehicle
@@ -231,36 +226,6 @@ class RoverFence(ArduPilotFence[RoverHost]):
     def on_mode_changed(self) -> None:
         super().on_mode_changed()
         self.recover_by_hand()
-
-
-class RoverSetpoints(GuidedSetpoints):
-    """Handlers of the set-point messages. ArduRover also accepts a heading or a turn rate without a velocity.
-
-    A thrust of 1 means the waypoint speed.
-    """
-
-    vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def refuse_acceleration(self, message: PositionTarget) -> None:
-        self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
-
-    def is_complete(self, target: GuidedTarget) -> bool:
-        # A target without a velocity must have either a heading or a turn rate, but not both.
-        return super().is_complete(target) or (target.yaw is None) != (target.yaw_rate is None)
-
-    def steer(self, message: SetAttitudeTarget) -> None:
-        if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
-            return
-        speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
-        _, _, heading = euler_from_quaternion(*message.q)
-        # The velocity has the direction of the heading. A negative speed is expressed by `backwards`.
-        velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
-        backwards = speed < 0
-        if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:
-            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw=heading)
-        else:
-            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw_rate=message.body_yaw_rate)
-        self.vehicle.guided.set_target(target)
 
 
 _AMPERES_AT_FULL = 16.0
@@ -293,22 +258,21 @@ class SimulatedRover(RoverHost):
     Not simulated: boats, driving in circles, braking before a fence.
     """
 
-    KIND: ClassVar[Kind] = "rover"
-    FIRMWARE: ClassVar[str] = "ArduRover"
-    MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
-    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
-    REPORTS_HOME: ClassVar[bool] = True
-    BASE_FLAGS: ClassVar[int] = MavModeFlag.CUSTOM_MODE_ENABLED
-    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
-    CAPABILITIES: ClassVar[int] = 0xF1EF
-    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
-    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = ROVER_MODES
-    ARMING: ClassVar[type[ArduPilotArming[Any]]] = RoverArming
-    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = RoverFailsafes
-    FENCE: ClassVar[type[ArduPilotFence[Any]]] = RoverFence
-    MOTORS: ClassVar[type[ArduPilotMotors]] = RoverMotors
-    JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
-    SETPOINTS: ClassVar[type[Any]] = RoverSetpoints
+    KIND = "rover"
+    FIRMWARE = "ArduRover"
+    MAV_TYPE = MavType.GROUND_ROVER
+    HOME_NEEDS_ORIGIN = False
+    REPORTS_HOME = True
+    BASE_FLAGS = MavModeFlag.CUSTOM_MODE_ENABLED
+    GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
+    CAPABILITIES = 0xF1EF
+    BUILDERS = BUILDERS_OF_KIND["rover"]
+    MODES = ROVER_MODES
+    ARMING = RoverArming
+    FAILSAFES = RoverFailsafes
+    FENCE = RoverFence
+    MOTORS = RoverMotors
+    JOYSTICK = RoverJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""

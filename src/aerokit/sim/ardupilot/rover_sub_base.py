@@ -17,7 +17,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.host import ArduPilotMode
+from aerokit.sim.ardupilot.host import GuidedMode
 from aerokit.sim.ardupilot.mission_run import MissionMode, place_of, set_home_from
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
@@ -42,8 +42,18 @@ class GuidedTarget:
     """Seconds after which a target without a position expires."""
 
 
-class GuidedTargetMode(ArduPilotMode):
-    """Base of the guided modes: goes to a place, or follows a target without a place until the target expires."""
+class GuidedTargetMode(GuidedMode):
+    """Base of the guided modes: goes to a place, or follows a target without a place until the target expires.
+
+    Invalid set-points are ignored. A subclass selects what a firmware supports.
+    """
+
+    BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
+    """MAV_FRAMEs whose vectors are relative to the heading."""
+    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = _BODY
+    """MAV_FRAMEs whose yaw is relative to the heading."""
+    GLOBAL_YAW: ClassVar[bool] = True
+    """True if the firmware uses the yaw and the turn rate of SET_POSITION_TARGET_GLOBAL_INT."""
 
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
@@ -68,54 +78,33 @@ class GuidedTargetMode(ArduPilotMode):
             self._target = target
             self._target_at = self.vehicle.now
 
-
-class GuidedSetpoints:
-    """Handlers of the set-point messages. Invalid messages are ignored. A subclass selects what a firmware supports."""
-
-    BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
-    """MAV_FRAMEs whose vectors are relative to the heading."""
-    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = _BODY
-    """MAV_FRAMEs whose yaw is relative to the heading."""
-    GLOBAL_YAW: ClassVar[bool] = True
-    """True if the firmware uses the yaw and the turn rate of SET_POSITION_TARGET_GLOBAL_INT."""
-
-    def __init__(self, vehicle: RoverSubVehicle) -> None:
-        self.vehicle: RoverSubVehicle = vehicle
-        vehicle.on(SetPositionTargetLocalNed, self._on_local)
-        vehicle.on(SetPositionTargetGlobalInt, self._on_global)
-        vehicle.on(SetAttitudeTarget, self._on_attitude)
-
     def refuse_acceleration(self, message: PositionTarget) -> None: ...
 
     def steer(self, message: SetAttitudeTarget) -> None:
         raise NotImplementedError
 
-    def is_complete(self, target: GuidedTarget) -> bool:
+    def accepts(self, target: GuidedTarget) -> bool:
         """Return True if the firmware accepts this combination of values."""
         return target.position is not None or target.velocity is not None
 
-    @property
-    def _is_guided(self) -> bool:
-        return self.vehicle.mode is self.vehicle.guided
-
-    def _on_attitude(self, message: SetAttitudeTarget, _: Channel) -> None:
-        if self._is_guided and all(map(math.isfinite, (*message.q, message.thrust, message.body_yaw_rate))):
+    def on_attitude_target(self, message: SetAttitudeTarget, _: Channel) -> None:
+        if self.is_active and all(map(math.isfinite, (*message.q, message.thrust, message.body_yaw_rate))):
             self.steer(message)
 
-    def _on_local(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
+    def on_local_target(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
         if message.coordinate_frame in _FIXED | self.BODY_FRAMES:
-            self._follow(message, self.vehicle.local_point(message, self.BODY_FRAMES), uses_yaw=True)
+            self._set_target_from(message, self.vehicle.local_point(message, self.BODY_FRAMES), uses_yaw=True)
 
-    def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
+    def on_global_target(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
         frame = message.coordinate_frame
         point = self.vehicle.world_point(message.lat_int, message.lon_int, message.alt, frame)
         if point is not None or not Setpoint.of(message).has_position:
-            self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
+            self._set_target_from(message, point, uses_yaw=self.GLOBAL_YAW)
 
-    def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
+    def _set_target_from(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
         """Follow a set-point in GUIDED. ``point`` is its position in the world frame."""
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
-        if not self._is_guided:
+        if not self.is_active:
             return
         if setpoint.has_acceleration:
             self.refuse_acceleration(message)
@@ -135,8 +124,8 @@ class GuidedSetpoints:
         if velocity is not None and frame in self.BODY_FRAMES:
             velocity = rotated(velocity, self.vehicle.motion.yaw)
         target = GuidedTarget(position, velocity, backwards=backwards, yaw=yaw, yaw_rate=yaw_rate)
-        if self.is_complete(target):
-            self.vehicle.guided.set_target(target)
+        if self.accepts(target):
+            self.set_target(target)
 
 
 class RoverSubVehicle(ArduPilotVehicle):

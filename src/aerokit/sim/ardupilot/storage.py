@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar
 
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.frame import Frame
@@ -37,7 +36,7 @@ class ArduPilotLogServer(LogServer):
     A request during a transfer, or for an unknown log, gets no data.
     """
 
-    FOLDER: ClassVar[str] = "/APM/LOGS"
+    FOLDER = "/APM/LOGS"
     _vehicle: ArduPilotHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, vehicle: ArduPilotHost, logs: Sequence[SimulatedLog], files: FileTree) -> None:
@@ -140,7 +139,7 @@ class ArduPilotSigning(VehicleSigning):
     bit takes effect at the next boot or SETUP_SIGNING.
     """
 
-    AHEAD: ClassVar[int] = ONE_MINUTE
+    AHEAD = ONE_MINUTE
     _vehicle: ArduPilotHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, vehicle: ArduPilotHost, key: SigningKey | None, timestamp: int) -> None:

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import cycle
-from typing import Any, ClassVar
 
-from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity, MavType, SpeedType, SubMode
-from aerokit.mavlink.messages import SetAttitudeTarget
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, SpeedType, SubMode
 from aerokit.sim.ardupilot.commands import commanded_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors
-from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.radio import ArduPilotJoystick, SubJoystick
+from aerokit.sim.ardupilot.radio import SubJoystick
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
-from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
 from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided, SubHost
-from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
 from aerokit.sim.commands import CommandHandler, ReceivedCommand
-from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
+from aerokit.sim.motion import SimulatedWind
 from aerokit.sim.vehicle_motion import UnderwaterMotion
 
 _BUTTONS = range(16)
@@ -32,8 +26,8 @@ _DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
 class SubArming(ArduPilotArming[SubHost]):
     """ArduSub's arming checks. By default, they do not require a position."""
 
-    ARMED_TEXT: ClassVar[str] = "Arming motors"
-    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
+    ARMED_TEXT = "Arming motors"
+    DISARMED_TEXT = "Disarming motors"
 
     def reasons(self) -> list[str]:
         if self.vehicle.is_initialised and not self._has_disarm_button():
@@ -66,7 +60,7 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
     """ArduSub's failsafes, except those of terrain, estimator and crash. Most of them act only while armed."""
 
-    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
+    BATTERY_PRIORITIES = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
@@ -192,26 +186,6 @@ class _HullLimit:
             sub.send_text(MavSeverity.WARNING, f"Internal {self._quantity} critical!")
 
 
-class SubSetpoints(GuidedSetpoints):
-    """Handlers of the set-point messages. Yaw is relative to the heading only in BODY_OFFSET_NED.
-
-    In SET_ATTITUDE_TARGET, thrust sets a climb rate (0.5 holds the depth). Roll and pitch have no effect.
-    """
-
-    BODY_FRAMES: ClassVar[frozenset[int]] = GuidedSetpoints.BODY_FRAMES | {MavFrame.BODY_FRD}
-    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = frozenset({MavFrame.BODY_OFFSET_NED})
-    GLOBAL_YAW: ClassVar[bool] = False
-
-    def steer(self, message: SetAttitudeTarget) -> None:
-        if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
-            return
-        climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)  # A thrust of 0.5 holds the depth.
-        max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
-        climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
-        _, _, yaw = euler_from_quaternion(*message.q)
-        self.vehicle.guided.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
-
-
 _HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44
 _AMPERES_AT_FULL = 26.3
 
@@ -246,19 +220,18 @@ class SimulatedSub(SubHost):
     the surface.
     """
 
-    KIND: ClassVar[Kind] = "sub"
-    FIRMWARE: ClassVar[str] = "ArduSub"
-    MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
-    BASE_FLAGS: ClassVar[int] = int(_BASE)
-    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
-    CAPABILITIES: ClassVar[int] = 0xF9E7
-    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
-    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = SUB_MODES
-    ARMING: ClassVar[type[ArduPilotArming[Any]]] = SubArming
-    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = SubFailsafes
-    MOTORS: ClassVar[type[ArduPilotMotors]] = SubMotors
-    JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
-    SETPOINTS: ClassVar[type[Any]] = SubSetpoints
+    KIND = "sub"
+    FIRMWARE = "ArduSub"
+    MAV_TYPE = MavType.SUBMARINE
+    BASE_FLAGS = int(_BASE)
+    GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
+    CAPABILITIES = 0xF9E7
+    BUILDERS = BUILDERS_OF_KIND["sub"]
+    MODES = SUB_MODES
+    ARMING = SubArming
+    FAILSAFES = SubFailsafes
+    MOTORS = SubMotors
+    JOYSTICK = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
         """Create the motion model. Each unit of SIM_BUOYANCY accelerates upwards by 0.1 m/s². Wind has no effect."""

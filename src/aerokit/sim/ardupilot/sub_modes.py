@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import cycle
+from typing import ClassVar
 
-from aerokit.mavlink.enums import SubMode
+from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
+from aerokit.mavlink.enums import MavFrame, SubMode
+from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.host import RC_THROTTLE, RC_YAW, SUB_FORWARD, SUB_LATERAL, ArduPilotMode, variant
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, GuidedTargetMode, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.commands import rotated
-from aerokit.sim.motion import Ned, wrap_pi
+from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 from aerokit.sim.vehicle_motion import UnderwaterMotion
 
 _MIN_LOOK_AHEAD_M, _MIN_TRAVEL_M_S = 1.0, 0.05
@@ -149,7 +152,15 @@ class SubAuto(RoverSubAuto):
 
 
 class SubGuided(GuidedTargetMode):
-    """GUIDED: moves to a place, or for up to three seconds with a velocity. Without a target it stops."""
+    """GUIDED: moves to a place, or for up to three seconds with a velocity. Without a target it stops.
+
+    In SET_ATTITUDE_TARGET, thrust sets a climb rate (0.5 holds the depth). Roll and pitch have no effect. Yaw is
+    relative to the heading only in BODY_OFFSET_NED.
+    """
+
+    BODY_FRAMES: ClassVar[frozenset[int]] = GuidedTargetMode.BODY_FRAMES | {MavFrame.BODY_FRD}
+    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = frozenset({MavFrame.BODY_OFFSET_NED})
+    GLOBAL_YAW: ClassVar[bool] = False
 
     number: int = SubMode.GUIDED
     name = "GUIDED"
@@ -194,6 +205,15 @@ class SubGuided(GuidedTargetMode):
             motion.turn(target.yaw_rate)
         else:
             motion.turn(0.0)  # Hold the heading.
+
+    def steer(self, message: SetAttitudeTarget) -> None:
+        if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
+            return
+        climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)  # A thrust of 0.5 holds the depth.
+        max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
+        climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
+        _, _, yaw = euler_from_quaternion(*message.q)
+        self.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
 
 
 SUB_MODES: tuple[Callable[[SubHost], ArduPilotMode], ...] = (

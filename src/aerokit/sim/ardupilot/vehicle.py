@@ -75,8 +75,6 @@ class ArduPilotVehicle(ArduPilotHost):
     MOTORS: ClassVar[type[ArduPilotMotors]] = ArduPilotMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = ArduPilotJoystick
     """Receiver of MANUAL_CONTROL."""
-    SETPOINTS: ClassVar[type[Any]]
-    """Handlers of set-point messages."""
 
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
     """True if home cannot be set before the estimator has an origin."""
@@ -162,6 +160,9 @@ class ArduPilotVehicle(ArduPilotHost):
         self.rc.release_overrides()
         modes = [make_mode(self) for make_mode in self.MODES]
         self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in modes}
+        self.on(m.SetPositionTargetLocalNed, self.guided.on_local_target)
+        self.on(m.SetPositionTargetGlobalInt, self.guided.on_global_target)
+        self.on(m.SetAttitudeTarget, self.guided.on_attitude_target)
         self.reset_controllers()
         self.mission: MissionRun = MissionRun(
             self, self.auto, self.camera
@@ -175,7 +176,6 @@ class ArduPilotVehicle(ArduPilotHost):
     def _listen(self) -> None:
         self.requests: ArduPilotMessageRequests = ArduPilotMessageRequests(self, stream_groups=self._stream_groups)
         self.serve_commands(self.make_commands())
-        self.SETPOINTS(self)
         self.on(m.Heartbeat, self._on_heartbeat)
         self.on(m.SetMode, self._on_set_mode)
         self.JOYSTICK(self)
