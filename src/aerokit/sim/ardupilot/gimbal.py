@@ -17,10 +17,12 @@ from aerokit.mavlink.enums import (
     MavFrame,
     MavMountMode,
     MavResult,
+    MavSeverity,
 )
-from aerokit.mavlink.messages import GlobalPositionInt
+from aerokit.protocols.servers.gimbal import Angles, angles_and_rates
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.channel import Channel
+from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.motion import Ned, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
@@ -37,8 +39,9 @@ _CAPABILITIES = (
     | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_FOLLOW | _Can.HAS_YAW_LOCK
 )  # fmt: skip
 _FROM_NORTH = frozenset({MavMountMode.GPS_POINT, MavMountMode.SYSID_TARGET, MavMountMode.HOME_LOCATION})
-
-
+_PLAIN_MOUNT_MODES = frozenset(
+    {MavMountMode.RETRACT, MavMountMode.NEUTRAL, MavMountMode.RC_TARGETING, MavMountMode.HOME_LOCATION}
+)
 _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 
@@ -66,7 +69,9 @@ class ArduPilotGimbal:
         self._region: Ned | None = None  # region of interest; None if there is none
         self._followed_id = 0  # system id of the followed vehicle
         self._followed_place: Ned | None = None  # None until its position is received
-        vehicle.observe(GlobalPositionInt, self._on_global_position)
+        vehicle.observe(m.GlobalPositionInt, self._on_global_position)
+        vehicle.on(m.GimbalManagerSetAttitude, self._on_manager_message)
+        vehicle.on(m.GimbalManagerSetPitchyaw, self._on_manager_message)
 
     @property
     def is_fitted(self) -> bool:
@@ -172,7 +177,7 @@ class ArduPilotGimbal:
         self._followed_place = None
         self.set_mode(MavMountMode.SYSID_TARGET)
 
-    def _on_global_position(self, message: GlobalPositionInt, _: Channel) -> None:
+    def _on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
         sender_system, _component = sender_of(message)
         if sender_system != self._followed_id:
             return
@@ -180,24 +185,76 @@ class ArduPilotGimbal:
         if place is not None:
             self._followed_place = place
 
-    def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
-        """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Return False for invalid ids."""
+    def _is_selected(self, device_id: float) -> bool:
+        """Return True if there is a gimbal, and ``device_id`` selects it. 0 selects all gimbals."""
+        return self.is_fitted and to_int(device_id) in (0, _DEVICE_ID)
+
+    def configure_mount(self, command: ReceivedCommand) -> int:
+        if not self.is_fitted:
+            return MavResult.FAILED
+        self.set_mode(to_int(command.param1))
+        return MavResult.ACCEPTED
+
+    def control_mount(self, command: ReceivedCommand) -> int:
+        mode = to_int(command.z)
+        if not self.is_fitted:
+            return MavResult.FAILED
+        if mode in _PLAIN_MOUNT_MODES:
+            self.set_mode(mode)
+            return MavResult.ACCEPTED
+        if mode == MavMountMode.MAVLINK_TARGETING:
+            pitch, roll, yaw = command.param1, command.param2, command.param3
+            if abs(pitch) > 90.0 or abs(roll) > 180.0 or abs(yaw) > 360.0:
+                self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
+                return MavResult.FAILED
+            self.point(roll, pitch, yaw, from_north=False)
+            return MavResult.ACCEPTED
+        # Before AP 4.2, params 1 and 2 contained the position. Newer firmware refuses such a command
+        # (AP_Mount_Backend.cpp).
+        has_place_in_params = command.param1 and command.param2 and not command.x and not command.y
+        if mode == MavMountMode.GPS_POINT and not has_place_in_params:
+            altitude = float(to_int(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
+            frame = MavFrame.GLOBAL_RELATIVE_ALT
+            # The firmware does not check the place. In the simulation, an invalid place makes the gimbal stop looking
+            # at its present target.
+            self.look_at(self._vehicle.world_point(to_int(command.x), to_int(command.y), altitude, frame))
+            return MavResult.ACCEPTED
+        return MavResult.FAILED
+
+    def configure_manager(self, command: ReceivedCommand) -> int:
+        system, component = to_int(command.param1), to_int(command.param2)
         are_ids_valid = all(_MIN_ID <= number <= 255 for number in (system, component))
-        if not are_ids_valid:
-            return False
+        if not self._is_selected(command.z) or not are_ids_valid:
+            return MavResult.FAILED
         previous = self.in_control
         if system == _TAKE_CONTROL:
-            self.in_control = sender
+            self.in_control = command.sender
         elif system == _RELEASE_CONTROL:
-            self.in_control = (0, 0) if previous == sender else previous
+            self.in_control = (0, 0) if previous == command.sender else previous
         elif system != _KEEP_CONTROL:
             self.in_control = (system, component)
         if self.in_control != previous:
             # The status follows the acknowledgement.
             self._vehicle.call_later(0.0, lambda: self._vehicle.send_built(m.GimbalManagerStatus.ID))
-        return True
+        return MavResult.ACCEPTED
 
-    def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
+    def point_or_turn(self, command: ReceivedCommand) -> int:
+        if not self._is_selected(command.z):
+            return MavResult.FAILED
+        angles, rates = (0.0, command.param1, command.param2), (0.0, command.param3, command.param4)
+        return self._manage(to_int(command.x), angles, rates)
+
+    def _on_manager_message(self, message: m.GimbalManagerSetAttitude | m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        if isinstance(message, m.GimbalManagerSetAttitude):
+            angles, rates = angles_and_rates(message)
+        else:
+            angles, rates = (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate)
+        has_both = not any(map(math.isnan, (*angles, *rates)))
+        if self._is_selected(message.gimbal_device_id) and not has_both:  # The firmware ignores angles with rates.
+            roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate = map(math.degrees, (*angles, *rates))
+            self._manage(message.flags, (roll, pitch, yaw), (roll_rate, pitch_rate, yaw_rate))
+
+    def _manage(self, flags: int, angles: Angles, rates: Angles) -> int:
         """Apply GIMBAL_MANAGER_FLAGS with angles or rates. Values that are not given are NaN."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         (_, pitch, yaw), (_, pitch_rate, yaw_rate) = angles, rates
@@ -218,10 +275,18 @@ class ArduPilotGimbal:
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
         if not self.is_fitted:
             return None
+        # The reported yaw is relative to the nose, even with YAW_LOCK.
+        flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
+        if self.mode == MavMountMode.RETRACT:
+            flags |= GimbalDeviceFlags.RETRACT
+        elif self.mode == MavMountMode.NEUTRAL:
+            flags |= GimbalDeviceFlags.NEUTRAL
+        elif self.mode in _FROM_NORTH or self.target.is_from_north:
+            flags |= GimbalDeviceFlags.YAW_LOCK
         roll, pitch, yaw = map(math.radians, self.angles)
         unknown = math.nan
         return m.GimbalDeviceAttitudeStatus(
-            target_system=0, target_component=0, time_boot_ms=self._vehicle.time_boot_ms, flags=_device_flags(self),
+            target_system=0, target_component=0, time_boot_ms=self._vehicle.time_boot_ms, flags=flags,
             q=quaternion_from_euler(roll, pitch, yaw), angular_velocity_x=unknown, angular_velocity_y=unknown,
             angular_velocity_z=unknown, failure_flags=0, delta_yaw=unknown, delta_yaw_velocity=unknown,
             gimbal_device_id=_DEVICE_ID,
@@ -249,15 +314,3 @@ class ArduPilotGimbal:
             primary_control_sysid=system, primary_control_compid=component, secondary_control_sysid=0,
             secondary_control_compid=0,
         )  # fmt: skip
-
-
-def _device_flags(gimbal: ArduPilotGimbal) -> int:
-    # The reported yaw is relative to the nose, even with YAW_LOCK.
-    flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
-    if gimbal.mode == MavMountMode.RETRACT:
-        flags |= GimbalDeviceFlags.RETRACT
-    elif gimbal.mode == MavMountMode.NEUTRAL:
-        flags |= GimbalDeviceFlags.NEUTRAL
-    elif gimbal.mode in _FROM_NORTH or gimbal.target.is_from_north:
-        flags |= GimbalDeviceFlags.YAW_LOCK
-    return flags

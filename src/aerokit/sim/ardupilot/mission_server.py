@@ -34,7 +34,6 @@ from aerokit.sim.missions import float32
 from aerokit.sim.vehicle import sender_of
 
 _DEGREE = 1e7
-_MAX_COMMANDS, _MAX_RALLY_POINTS = 650, 46
 _GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3
 _FENCE_UPDATE_INTERVAL_S = 0.1
 
@@ -49,14 +48,12 @@ class ArduPilotMissionServer(MissionServer):
     def __init__(self, vehicle: ArduPilotHost) -> None:
         super().__init__(vehicle)
         self._vehicle = vehicle
-        self.commands: CommandList = CommandList(
-            _MAX_COMMANDS, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
-        )
+        self.commands: CommandList = CommandList(self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND)
         """The mission."""
         self.fence: FenceList = FenceList(self._on_fence_total)
         self._fence_total = 0
         self._was_fence_stored = False  # since the boot
-        self.rally: RallyList = RallyList(_MAX_RALLY_POINTS)
+        self.rally: RallyList = RallyList()
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,
             MavMissionType.FENCE: self.fence,

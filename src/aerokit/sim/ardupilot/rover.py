@@ -300,10 +300,6 @@ class SimulatedRover(RoverHost):
         manual_input = MavModeFlag.MANUAL_INPUT_ENABLED if self.mode.name in _MANUAL_INPUT else 0
         return super().base_mode | manual_input
 
-    @property
-    def is_at_rest(self) -> bool:
-        return abs(self.motion.speed_m_s) < 0.01
-
     def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         return "Flight mode change failed"
 

@@ -145,12 +145,6 @@ class RoverAuto(RoverSubAuto):
 
     vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def default_speed(self) -> float:
-        return self.vehicle.waypoint_speed
-
-    def refuse(self) -> None:
-        self.vehicle.send_text(MavSeverity.NOTICE, "No Mission. Can't set AUTO.")
-
     def travel(self, place: Ned, *, stops: bool) -> None:
         if stops and self.has_arrived(place):
             self.vehicle.motion.stop()
@@ -160,16 +154,9 @@ class RoverAuto(RoverSubAuto):
     def has_arrived(self, place: Ned) -> bool:
         return self.vehicle.has_arrived(place) if self._stops else self.vehicle.has_passed(place)
 
-    def stay(self) -> None:
-        self.vehicle.motion.stop()
-
     def reached_text(self, index: int, seconds: float) -> str:
         text = f"Reached waypoint #{index}"
         return f"{text}. Loiter for {seconds:.0f} seconds" if seconds > 0 else text
-
-    def finish(self) -> None:
-        # The rover stops here, because only MIS_DONE_BEHAVE 0 (hold) is simulated.
-        self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
 
 
 class RoverGuided(GuidedTargetMode):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd as Cmd
-from aerokit.mavlink.enums import MavFrame, MavResult, SpeedType
+from aerokit.mavlink.enums import MavFrame, MavResult, MavSeverity, SpeedType
 from aerokit.mavlink.messages import (
     MissionItemReached,
     SetAttitudeTarget,
@@ -23,6 +23,7 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, PositionTarget, ReceivedCommand, Setpoint, is_finite, rotated
 from aerokit.sim.motion import Ned
+from aerokit.sim.vehicle_motion import GroundMotion, UnderwaterMotion
 
 _BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
 _FIXED = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED})
@@ -131,12 +132,11 @@ class GuidedTargetMode(GuidedMode):
 class RoverSubVehicle(ArduPilotVehicle):
     """Base of Rover and Sub. Takes the arguments of `ArduPilotVehicle`."""
 
-    @property
-    def guided(self) -> GuidedTargetMode:
-        raise NotImplementedError
+    motion: GroundMotion | UnderwaterMotion  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property
-    def is_at_rest(self) -> bool:
+    def waypoint_speed(self) -> float:
+        """Speed between waypoints in m/s, which parameters define."""
         raise NotImplementedError
 
     @property
@@ -158,7 +158,7 @@ class RoverSubVehicle(ArduPilotVehicle):
         self.motors.update(dt, landed=False)  # Rovers and submarines do not land.
         self.move(dt)
         self.battery.drain(self.motors.current_a, dt)
-        if not self.motors.is_armed and self.is_at_rest:
+        if not self.motors.is_armed and self.motion.is_still:
             self.set_ticking(False)
 
     def make_commands(self) -> dict[int, CommandHandler]:
@@ -202,26 +202,14 @@ class RoverSubAuto(MissionMode):
             **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
         }
 
-    def default_speed(self) -> float:
-        """Return the speed in m/s that the parameters define."""
-        raise NotImplementedError
-
-    def refuse(self) -> None:
-        """Report that there is no mission."""
-
     def travel(self, place: Ned, *, stops: bool) -> None:
         raise NotImplementedError
 
     def has_arrived(self, place: Ned) -> bool:
         raise NotImplementedError
 
-    def stay(self) -> None:
-        raise NotImplementedError
-
     def reached_text(self, index: int, seconds: float) -> str:
         raise NotImplementedError
-
-    def finish(self) -> None: ...
 
     @property
     def destination(self) -> Ned | None:
@@ -231,9 +219,10 @@ class RoverSubAuto(MissionMode):
         if self.vehicle.mode is self:  # Arming enters the current mode again, which must not restart the mission.
             return True
         if not self.vehicle.mission.is_present:
-            self.refuse()
+            if self.vehicle.KIND == "rover":
+                self.vehicle.send_text(MavSeverity.NOTICE, "No Mission. Can't set AUTO.")
             return False
-        self.speed = self.default_speed()
+        self.speed = self.vehicle.waypoint_speed
         self._place = None
         self.wait_for_origin()
         return True
@@ -245,7 +234,7 @@ class RoverSubAuto(MissionMode):
         if self.vehicle.mode is not self:  # The mission has changed the mode.
             return
         if self._place is None:
-            self.stay()
+            self.vehicle.motion.stop()
         else:
             self.travel(self._place, stops=self._stops)
 
@@ -257,7 +246,8 @@ class RoverSubAuto(MissionMode):
 
     def end_mission(self) -> None:
         self._place = None
-        self.finish()
+        if self.vehicle.KIND == "rover":  # The rover stops, because only MIS_DONE_BEHAVE 0 (hold) is simulated.
+            self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
         command, now = item.command, self.vehicle.now

@@ -254,10 +254,6 @@ class SimulatedSub(SubHost):
     def guided(self) -> SubGuided:
         return self.mode_of(SubGuided)
 
-    @property
-    def is_at_rest(self) -> bool:
-        return self.motion.is_still
-
     def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         if reason == "requires position":
             return f"Mode change failed: {mode.name} requires position"

@@ -32,6 +32,10 @@ class SubHost(RoverSubVehicle):
     hull_temperature_c: float = 28.0
 
     @property
+    def waypoint_speed(self) -> float:
+        return self.parameters["WPNAV_SPEED"] / 100.0
+
+    @property
     def is_at_surface(self) -> bool:
         """True within SURFACE_DEPTH of the surface."""
         return self.motion.down <= max(0.0, -self.parameters["SURFACE_DEPTH"] / 100.0)
@@ -135,17 +139,11 @@ class SubAuto(RoverSubAuto):
 
     vehicle: SubHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def default_speed(self) -> float:
-        return self.vehicle.parameters["WPNAV_SPEED"] / 100.0
-
     def travel(self, place: Ned, *, stops: bool) -> None:
         self.vehicle.travel(place, self.speed)
 
     def has_arrived(self, place: Ned) -> bool:
         return self.vehicle.distance(place) <= self.vehicle.parameters["WPNAV_RADIUS"] / 100.0
-
-    def stay(self) -> None:
-        self.vehicle.motion.seek_velocity(0.0, 0.0, 0.0)
 
     def reached_text(self, index: int, seconds: float) -> str:
         return f"Reached command #{index}"
@@ -170,7 +168,7 @@ class SubGuided(GuidedTargetMode):
 
     def enter(self, *, force: bool) -> bool:
         self._place = self._target = self._heading = None
-        self.speed: float = self.vehicle.parameters["WPNAV_SPEED"] / 100.0
+        self.speed: float = self.vehicle.waypoint_speed
         return True
 
     def go_to(self, position: Ned) -> None:
@@ -198,7 +196,7 @@ class SubGuided(GuidedTargetMode):
         elif target is not None and target.velocity is not None:
             motion.seek_velocity(*target.velocity)
         else:
-            motion.seek_velocity(0.0, 0.0, 0.0)
+            motion.stop()
         if self._heading is not None:
             motion.face(self._heading)
         elif target is not None and target.yaw_rate is not None:
