@@ -165,9 +165,6 @@ class ArduPilotCamera:
             foc_len=0.0, flags=CameraFeedbackFlags.PHOTO, completed_captures=0,
         )  # fmt: skip
 
-    def last_feedback(self) -> m.CameraFeedback | None:
-        return self.feedback if self.is_fitted else None
-
     def information(self) -> m.CameraInformation | None:
         if not self.is_fitted:
             return None

@@ -8,7 +8,6 @@ NAV_SCRIPT_TIME, NAV_ATTITUDE_TIME, DO_GUIDED_LIMITS.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import islice
 from typing import Protocol
 
@@ -18,7 +17,7 @@ from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
 from aerokit.sim.ardupilot.host import RC_THROTTLE
-from aerokit.sim.ardupilot.mission_run import TAKE_OFFS, MissionCommand, MissionMode, place_of, set_home_from
+from aerokit.sim.ardupilot.mission_run import TAKE_OFFS, MissionCommand, MissionMode, place_of
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
@@ -166,7 +165,7 @@ _WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_LOITE
 _LANDINGS = frozenset({Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND})
 _UNTIL_LEG_ENDS = TAKE_OFFS | {Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT, Cmd.NAV_RETURN_TO_LAUNCH}
 _WITHOUT_EFFECT = (
-    Cmd.DO_FENCE_ENABLE, Cmd.DO_WINCH, Cmd.DO_RETURN_PATH_START, Cmd.DO_LAND_START, Cmd.DO_MOUNT_CONTROL,
+    Cmd.DO_WINCH, Cmd.DO_RETURN_PATH_START, Cmd.DO_LAND_START, Cmd.DO_MOUNT_CONTROL,
     Cmd.DO_GUIDED_LIMITS, Cmd.NAV_GUIDED_ENABLE, Cmd.CONDITION_DISTANCE,
 )  # fmt: skip
 
@@ -186,22 +185,19 @@ class CopterAuto(MissionMode):
         self._leg: _Leg | None = None  # None while the copter holds its position.
         self._last_reached = 0  # index of the command to report in MISSION_ITEM_REACHED; 0 if there is none
         self._reached_at: float | None = None  # None until the copter reaches the waypoint.
-        self._condition_started_at = 0.0
         self._delay_until = 0.0
         self._list_version = -1  # version of the command list from which `_upcoming` was read
         # The current and the next navigation commands. They are compared to notice an upload that changes them.
         self._upcoming: tuple[MissionCommand, ...] = ()
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {
+        self.handlers |= {
             **dict.fromkeys(TAKE_OFFS, self._take_off),
             **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TO_ALT), self._fly),
             **dict.fromkeys(_LANDINGS, self._land),
             Cmd.NAV_LOITER_TURNS: self._circle,
             Cmd.NAV_RETURN_TO_LAUNCH: self._return,
             Cmd.NAV_DELAY: self._delay,
-            Cmd.CONDITION_DELAY: self._wait,
             Cmd.CONDITION_YAW: self._turn,
             Cmd.DO_CHANGE_SPEED: self._change_speed,
-            Cmd.DO_SET_HOME: lambda item: set_home_from(copter, item),
             **dict.fromkeys((Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE), self._look_at),
             **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
         }
@@ -314,7 +310,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.hold()
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
-        command, now = item.command, self.vehicle.now
+        command = item.command
         if command in _WAYPOINTS:
             return self._has_stayed(index, item.param1)
         if command in _UNTIL_LEG_ENDS:
@@ -326,9 +322,9 @@ class CopterAuto(MissionMode):
         if command == Cmd.NAV_GUIDED_ENABLE:
             return item.param1 == 0  # 0 ends the control by a companion computer, 1 starts it.
         if command == Cmd.NAV_DELAY:
-            return now > self._delay_until
+            return self.vehicle.now > self._delay_until
         if command == Cmd.CONDITION_DELAY:
-            return now - self._condition_started_at > max(0.0, item.param1)
+            return self._has_waited(item)
         if command == Cmd.CONDITION_DISTANCE:
             return self.distance_to_destination < max(0.0, item.param1)
         if command == Cmd.CONDITION_YAW:
@@ -362,7 +358,7 @@ class CopterAuto(MissionMode):
         copter.arming.disarm()
         return False
 
-    def _place(self, item: MissionItem) -> Ned:
+    def _place_of(self, item: MissionItem) -> Ned:
         current: Ned = self.vehicle.motion.place
         if isinstance(self._leg, _FlyLeg) and self._leg.is_complete:
             current = self._leg.destination  # more exact than the copter's position, which differs a little
@@ -381,7 +377,7 @@ class CopterAuto(MissionMode):
         if not stops:
             following = next(run.navigation_from(run.nav_index + 1), None)
             stops = following is None or following.item.command not in _NO_STOP_IF_FOLLOWED_BY
-        self._go(self._place(item), stops=stops)
+        self._go(self._place_of(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
         copter = self.vehicle
@@ -397,14 +393,14 @@ class CopterAuto(MissionMode):
         self._leg = _ClimbLeg(self, home_down - target_down)
 
     def _circle(self, item: MissionItem) -> None:
-        self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
+        self._leg = _CircleLeg(self, self._place_of(item), turns=item.param1, radius=item.param3)
 
     def _land(self, item: MissionItem) -> None:
         self.vehicle.yaw.hold()
         if (item.x, item.y) == (0, 0):
             self._leg = _DescendLeg(self.vehicle)
             return
-        north, east, _ = self._place(item)
+        north, east, _ = self._place_of(item)
         self._go((north, east, self.vehicle.motion.down))
 
     def _return(self, _: MissionItem) -> None:
@@ -416,9 +412,6 @@ class CopterAuto(MissionMode):
         seconds = max(0.0, item.param1)  # A negative number (to wait for a time of day) is not simulated.
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
-
-    def _wait(self, _: MissionItem) -> None:
-        self._condition_started_at = self.vehicle.now
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)

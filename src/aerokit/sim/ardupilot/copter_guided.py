@@ -113,22 +113,20 @@ class CopterGuided(CopterModeBase, GuidedMode):
         self._set_targets(submode, position=position, velocity=velocity, acceleration=acceleration)
         return True
 
-    def lean(self, roll: float, pitch: float, climb: float) -> None:
-        """Hold roll and pitch in radians and a climb rate in m/s."""
-        self.submode = GuidedSubmode.ATTITUDE
-        self._attitude = (roll, pitch)
-        self._attitude_climb = climb
-        self._body_rates = None
-        self._updated_at = self.vehicle.now
+    def set_attitude(
+        self, angles: tuple[float, float], climb: float, body_rates: tuple[float, float] | None = None
+    ) -> None:
+        """Hold roll and pitch in radians and a climb rate in m/s.
 
-    def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
-        """Change roll and pitch at these rates in rad/s, and climb at a rate in m/s."""
-        # The first call starts at the present attitude. Later calls continue from the commanded attitude.
-        if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
+        ``body_rates`` in rad/s replace the angles: they change the present or the last commanded roll and pitch.
+        """
+        if body_rates is None:
+            self._attitude = angles
+        elif self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
             self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
         self.submode = GuidedSubmode.ATTITUDE
         self._attitude_climb = climb
-        self._body_rates = (roll_rate, pitch_rate)
+        self._body_rates = body_rates
         self._updated_at = self.vehicle.now
 
     def pause(self) -> bool:
@@ -289,7 +287,6 @@ class CopterGuided(CopterModeBase, GuidedMode):
         climb_share = (constrained(target.thrust, 0.0, 1.0) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0
-        if not has_attitude and not ignored_rates:
-            guided.rotate(target.body_roll_rate, target.body_pitch_rate, climb)
-        else:
-            guided.lean(roll, pitch, climb)
+        has_rates_only = not has_attitude and not ignored_rates
+        body_rates = (target.body_roll_rate, target.body_pitch_rate) if has_rates_only else None
+        guided.set_attitude((roll, pitch), climb, body_rates)

@@ -14,8 +14,6 @@ from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotHost, ConditionTime
 _OK, _LOW, _CRITICAL = 0, 1, 2
 _NAMES_IN_PARAMETERS = {_LOW: "LOW", _CRITICAL: "CRT"}
 _NAMES_IN_TEXTS = {_LOW: "low", _CRITICAL: "critical"}
-# Parameters with the lowest voltage and charge of each level.
-_LIMITS = {_LOW: ("BATT_LOW_VOLT", "BATT_LOW_MAH"), _CRITICAL: ("BATT_CRT_VOLT", "BATT_CRT_MAH")}
 _PERIOD_S = 0.1
 
 
@@ -79,9 +77,9 @@ class BatteryFailsafe:
 
     def _low_quantities(self, level: int) -> tuple[bool, bool]:
         """Return (voltage is low, charge is low)."""
-        volts_name, mah_name = _LIMITS[level]
+        prefix, parameters = f"BATT_{_NAMES_IN_PARAMETERS[level]}", self._vehicle.parameters
         # The value 0 of these parameters means that there is no limit.
-        min_volts, min_mah = self._vehicle.parameters[volts_name], self._vehicle.parameters[mah_name]
+        min_volts, min_mah = parameters[f"{prefix}_VOLT"], parameters[f"{prefix}_MAH"]
         is_voltage_low = min_volts > 0 and self._vehicle.battery.voltage_v < min_volts
         is_charge_low = min_mah > 0 and self._remaining_mah() < min_mah
         return is_voltage_low, is_charge_low

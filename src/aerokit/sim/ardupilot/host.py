@@ -56,6 +56,7 @@ class ArduPilotMode:
 
     def __init__(self, vehicle: Any) -> None:
         self.vehicle = vehicle
+        self._place: Ned | None = None  # place to go to or to circle; None without one
 
     def enter(self, *, force: bool) -> bool:
         """Send the entry texts and start the mode. Return False to refuse the mode.
@@ -88,7 +89,7 @@ class ArduPilotMode:
 
     @property
     def destination(self) -> Ned | None:
-        return None
+        return self._place
 
 
 class GuidedMode(ArduPilotMode):
@@ -239,7 +240,7 @@ class ArduPilotMissionHost(Protocol):
     nav_index: int
 
     @property
-    def is_being_flown(self) -> bool: ...
+    def is_running(self) -> bool: ...
     @property
     def is_present(self) -> bool: ...
     def set_current(self, index: int) -> bool: ...

@@ -263,9 +263,8 @@ class SmartPath:
     point, is missing for 15 s, the path is deactivated and SMART_RTL is refused.
     """
 
-    def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self._only_armed = only_armed  # True if the path is recorded only while the vehicle is armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
         self._good_at = -math.inf  # time of the last good position
@@ -315,7 +314,8 @@ class SmartPath:
             if not self._is_started and vehicle.navigation.has_position:
                 self.reset()
             return
-        if vehicle.mode.returns_on_path or (self._only_armed and not vehicle.motors.is_armed):
+        is_disarmed_copter = vehicle.KIND == "copter" and not vehicle.motors.is_armed  # ArduRover records always.
+        if vehicle.mode.returns_on_path or is_disarmed_copter:
             return
         if not vehicle.navigation.has_position:
             if vehicle.now - self._good_at > _FAILURE_TIMEOUT_S:

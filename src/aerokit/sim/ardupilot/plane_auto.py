@@ -7,7 +7,6 @@ servo and camera commands. Other commands are skipped.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from aerokit.mavlink import messages as m
@@ -17,7 +16,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES, GuidedMode
-from aerokit.sim.ardupilot.mission_run import MissionMode, set_home_from
+from aerokit.sim.ardupilot.mission_run import MissionMode
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import ReceivedCommand, constrained, to_int
@@ -41,19 +40,16 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._on_circle_since = math.nan  # NaN before the plane has reached the circle
         self._turned_rad = 0.0  # angle flown around the circle
         self._last_bearing = 0.0  # bearing from the center of the circle at the last tick
-        self._condition_started_at = 0.0
         self._leg_start: Ned = (0.0, 0.0, 0.0)  # start of the straight line to the current waypoint
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {
+        self.handlers |= {
             Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
             **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
             **dict.fromkeys((Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME), self._start_loiter),
             **dict.fromkeys((Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT), self._start_loiter),
             Cmd.NAV_LAND: self._start_landing,
             Cmd.NAV_RETURN_TO_LAUNCH: self._return,
-            Cmd.CONDITION_DELAY: self._wait,
             Cmd.DO_CHANGE_SPEED: self._change_speed,
-            Cmd.DO_SET_HOME: lambda item: set_home_from(plane, item),
-            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START, Cmd.DO_FENCE_ENABLE), lambda _: None),
+            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START), lambda _: None),
         }
 
     @property
@@ -148,7 +144,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             is_at_height = abs(plane.wing.down - self._place_down) < _REACHED_HEIGHT_M
             return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
         if command == Cmd.CONDITION_DELAY:
-            return plane.now - self._condition_started_at > max(0.0, item.param1)
+            return self._has_waited(item)
         if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
             return False
         self.warn_if_unknown(item)
@@ -215,9 +211,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def _return(self, _: MissionItem) -> None:
         # ArduPlane changes the mode to RTL (commands_logic.cpp, start_command). The mode change stops the mission.
         self.vehicle.set_mode(PlaneMode.RTL)
-
-    def _wait(self, _: MissionItem) -> None:
-        self._condition_started_at = self.vehicle.now
 
     def _change_speed(self, item: MissionItem) -> None:
         if self.vehicle.is_valid_airspeed(item.param2):

@@ -246,7 +246,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     def update(self) -> None:
         super().update()
         if not self.enabled and self.caused_mode and self._mode_before is not None:
-            if self.vehicle.mode.number == PlaneMode.GUIDED and self._action in _RETURNS:
+            if self.vehicle.mode.number == PlaneMode.GUIDED and self.action in _RETURNS:
                 self.vehicle.set_mode(self._mode_before)
             self.caused_mode = False
 
@@ -256,11 +256,11 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             return
         self.report("breached", new_breaches)
         mode_before = plane.mode.number
-        if self._action == _RTL:
+        if self.action == _RTL:
             self._turn_back(mode_before, PlaneMode.RTL)
-        elif self._action == _AUTOLAND and mode_before != PlaneMode.AUTOLAND:  # A running landing continues.
+        elif self.action == _AUTOLAND and mode_before != PlaneMode.AUTOLAND:  # A running landing continues.
             self._turn_back(mode_before, PlaneMode.AUTOLAND, PlaneMode.RTL)
-        elif self._action in (_GUIDED, _GUIDED_THROTTLE):
+        elif self.action in (_GUIDED, _GUIDED_THROTTLE):
             self._turn_back(mode_before, PlaneMode.GUIDED)
             plane.guided.go_to(self.return_place())
 
@@ -291,14 +291,6 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         if not self.forbids_modes() or not self.vehicle.is_armed:
             return None
         return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
-
-    def on_mode_changed(self) -> None:
-        super().on_mode_changed()
-        self.recover_by_hand()
-
-    @property
-    def _action(self) -> int:
-        return int(self.vehicle.parameters["FENCE_ACTION"])
 
     def _turn_back(self, mode_before: int, *modes: int) -> None:
         self.enter_first_accepted(modes)

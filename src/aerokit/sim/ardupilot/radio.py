@@ -201,26 +201,22 @@ _AUX_POSITIONS = (0.0, 1.0, 2.0)
 
 
 class AuxiliaryOutputs:
-    """Servos, relays and auxiliary switches, set by DO_SET_SERVO, DO_SET_RELAY and DO_AUX_FUNCTION."""
+    """Servos and relays, set by DO_SET_SERVO and DO_SET_RELAY. DO_AUX_FUNCTION is answered, but has no effect."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.servos: dict[int, int] = {}  # Pulses in microseconds by output number, which counts from 1.
         self.relays: int = 0  # Bit mask of the relays that are on.
-        self.functions: dict[int, int] = {}  # Switch positions (0 low, 1 middle, 2 high) by auxiliary function.
 
     @property
     def relay_count(self) -> int:
         return _RELAYS.get(self._vehicle.KIND, 1)
 
-    def is_free(self, output: int) -> bool:
-        return self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) in _FREE_FUNCTIONS
-
     def set_servo(self, command: ReceivedCommand) -> int:
         output = to_int(command.param1)
         if not 1 <= output <= _SERVOS:
             return MavResult.FAILED
-        if not self.is_free(output):
+        if self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) not in _FREE_FUNCTIONS:
             self._vehicle.info(f"ServoRelayEvent: Channel {output} is already in use")
             return MavResult.FAILED
         self.servos[output] = to_int(command.param2)
@@ -245,5 +241,4 @@ class AuxiliaryOutputs:
         if not 0 <= function < _FUNCTIONS or function in _REFUSED_FUNCTIONS[self._vehicle.KIND]:
             self._vehicle.info(f"Invalid channel option ({function})")
             return MavResult.FAILED
-        self.functions[function] = to_int(command.param2)
         return MavResult.ACCEPTED

@@ -212,20 +212,14 @@ class RoverFence(ArduPilotFence[RoverHost]):
     MITIGATION = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        vehicle = self.vehicle
-        action = int(vehicle.parameters["FENCE_ACTION"])
-        if action == REPORT_ONLY:
+        if self.action == REPORT_ONLY:
             return
         if self.beyond_m(new_breaches) > _HOLD_BEYOND_M:
-            vehicle.set_mode(RoverMode.HOLD)
-        elif action == _TERMINATE:
-            vehicle.arming.disarm()
+            self.vehicle.set_mode(RoverMode.HOLD)
+        elif self.action == _TERMINATE:
+            self.vehicle.arming.disarm()
         else:
-            self.enter_first_accepted(_MODES.get(action, ()))
-
-    def on_mode_changed(self) -> None:
-        super().on_mode_changed()
-        self.recover_by_hand()
+            self.enter_first_accepted(_MODES.get(self.action, ()))
 
 
 _AMPERES_AT_FULL = 16.0

@@ -9,7 +9,7 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached, SetAttitudeTarget
 from aerokit.sim.ardupilot.host import RC_ROLL, RC_THROTTLE, ArduPilotMode, variant
-from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
+from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, GuidedTargetMode, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.commands import PositionTarget
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
@@ -26,11 +26,6 @@ class RoverHost(RoverSubVehicle):
 
     def reset_controllers(self) -> None:
         self.rc[RC_THROTTLE] = 1500
-        self.path: SmartPath = SmartPath(self, only_armed=False)
-
-    def _become_ready(self) -> None:
-        super()._become_ready()
-        self.path.start()
 
     @property
     def top_speed(self) -> float:

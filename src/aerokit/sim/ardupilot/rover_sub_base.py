@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +17,7 @@ from aerokit.mavlink.messages import (
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.host import GuidedMode
-from aerokit.sim.ardupilot.mission_run import MissionMode, place_of, set_home_from
+from aerokit.sim.ardupilot.mission_run import MissionMode, place_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, PositionTarget, ReceivedCommand, Setpoint, is_finite, rotated
@@ -59,13 +58,8 @@ class GuidedTargetMode(GuidedMode):
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
         self.speed: float = 0.0
-        self._place: Ned | None = None  # place to go to; None while the vehicle follows `_target`
-        self._target: GuidedTarget | None = None  # None if the vehicle must stop
+        self._target: GuidedTarget | None = None  # followed while there is no `_place`; None to stop
         self._target_at = 0.0
-
-    @property
-    def destination(self) -> Ned | None:
-        return self._place
 
     def go_to(self, position: Ned) -> None:
         self._place = position
@@ -178,7 +172,7 @@ class RoverSubVehicle(ArduPilotVehicle):
 _WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME})
 
 _WITHOUT_EFFECT = (
-    Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_FENCE_ENABLE, Cmd.DO_GUIDED_LIMITS,
+    Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_GUIDED_LIMITS,
     Cmd.CONDITION_DISTANCE,
 )  # fmt: skip
 
@@ -190,15 +184,13 @@ class RoverSubAuto(MissionMode):
 
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
-        self._place: Ned | None = None  # place of the current command; None if the vehicle stays
         self._stops = True  # True if the vehicle stops at `_place`
         self._reached_at: float | None = None  # time of arrival at `_place`; None before
         self._wait_until = 0.0  # end of a delay command
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {
+        self.handlers |= {
             **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_RETURN_TO_LAUNCH), self._go),
             **dict.fromkeys((Cmd.NAV_DELAY, Cmd.CONDITION_DELAY), self._wait),
             Cmd.DO_CHANGE_SPEED: self._change_speed,
-            Cmd.DO_SET_HOME: lambda item: set_home_from(vehicle, item),
             **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
         }
 
@@ -210,10 +202,6 @@ class RoverSubAuto(MissionMode):
 
     def reached_text(self, index: int, seconds: float) -> str:
         raise NotImplementedError
-
-    @property
-    def destination(self) -> Ned | None:
-        return self._place
 
     def enter(self, *, force: bool) -> bool:
         if self.vehicle.mode is self:  # Arming enters the current mode again, which must not restart the mission.

@@ -382,7 +382,7 @@ _ALL: Builders = {
     m.CameraInformation.ID: lambda vehicle: vehicle.camera.information(),
     m.CameraSettings.ID: lambda vehicle: vehicle.camera.settings(),
     m.CameraCaptureStatus.ID: lambda vehicle: vehicle.camera.capture_status(),
-    m.CameraFeedback.ID: lambda vehicle: vehicle.camera.last_feedback(),
+    m.CameraFeedback.ID: lambda vehicle: vehicle.camera.feedback if vehicle.camera.is_fitted else None,
     m.FenceStatus.ID: lambda vehicle: vehicle.fence.status(),
     m.MagCalProgress.ID: lambda vehicle: vehicle.calibrations.compasses.progress(),
     m.MagCalReport.ID: lambda vehicle: vehicle.calibrations.compasses.report(),

@@ -24,7 +24,7 @@ from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode, ArduPilotMo
 from aerokit.sim.ardupilot.kinds import BOOT_TIMELINES, BootTimeline, parameters_of
 from aerokit.sim.ardupilot.mission_run import MissionMode, MissionRun
 from aerokit.sim.ardupilot.mission_server import ArduPilotMissionServer
-from aerokit.sim.ardupilot.navigation import ArduPilotNavigation
+from aerokit.sim.ardupilot.navigation import ArduPilotNavigation, SmartPath
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio, AuxiliaryOutputs
 from aerokit.sim.ardupilot.requests import ArduPilotMessageRequests
 from aerokit.sim.ardupilot.storage import ArduPilotSigning, ArduPilotStorage
@@ -148,6 +148,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.is_landed: bool = self.motion.is_on_ground
         self.motors: ArduPilotMotors = self.MOTORS(self)
         self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.external)
+        self.path: SmartPath = SmartPath(self)  # Only ArduCopter and ArduRover record it.
         self.failsafes: ArduPilotFailsafes[Any] = self.FAILSAFES(self)
         self.arming: ArduPilotArming[Any] = self.ARMING(self, self.failsafes, self.calibrations.compasses)
         self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
@@ -263,6 +264,8 @@ class ArduPilotVehicle(ArduPilotHost):
         self.failsafes.start()
         # SITL is still in MAV_STATE_BOOT for about half a second after it has reported "ArduPilot Ready".
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
+        if self.KIND in ("copter", "rover"):
+            self.path.start()
 
     def _leave_boot(self) -> None:
         self.has_left_boot = True
