@@ -24,14 +24,11 @@ class ArduPilotCamera:
     heartbeats of the camera. CAM1_TYPE 0 disables the camera.
     """
 
-    image_count: int
-    remaining: int
-
     def __init__(self, vehicle: ArduPilotHost, gimbal: ArduPilotGimbal) -> None:
         self._vehicle, self._gimbal = vehicle, gimbal
-        self.image_count = 0  # Number of images since power-on.
+        self.image_count: int = 0  # Number of images since power-on.
         self.interval_s: float = 0.0  # Seconds between two images of a series.
-        self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
+        self.remaining: int = 0  # Number of images that the series still has to take; -1 is unlimited.
         self.trigger_distance_m: float = 0.0  # Metres between two images triggered by distance; 0 is off.
         self._taken_at = -math.inf  # time of the last image
         self._taken_place: Ned | None = None  # place of the last image

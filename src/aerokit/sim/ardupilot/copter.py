@@ -168,6 +168,8 @@ class SimulatedCopter(CopterHost):
     Not simulated: braking before a fence, the terrain failsafe.
     """
 
+    guided: CopterGuided  # pyright: ignore[reportIncompatibleVariableOverride]
+
     KIND = "copter"
     FIRMWARE = "ArduCopter"
     FRAME = "Frame: QUAD/PLUS"
@@ -202,9 +204,8 @@ class SimulatedCopter(CopterHost):
         self._on_ground_timer = ConditionTimer()
         self.motor_test: MotorTest = MotorTest(self)
 
-    @property
-    def guided(self) -> CopterGuided:
-        return self.mode_of(CopterGuided)
+    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
+        return f"Mode change to {mode.name} failed: {reason}"
 
     @property
     def is_armed(self) -> bool:

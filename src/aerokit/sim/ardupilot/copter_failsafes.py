@@ -169,7 +169,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
 
     def _check_ground_station(self) -> None:
         copter, parameters = self.vehicle, self.vehicle.parameters
-        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
+        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.vehicle.ground_station_seen_at):
             return
         is_lost = self.ground_station_silence > parameters["FS_GCS_TIMEOUT"]
         if is_lost == self.is_ground_station_lost:
@@ -318,7 +318,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         modes = _FENCE_ACTIONS.get(self.action, _FENCE_ACTIONS[_FENCE_RTL])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        self.enter_first_accepted(modes)
+        self.caused_mode = self.vehicle.enter_first_accepted(*modes)
 
     def on_cleared(self) -> None:
         if not self.vehicle.is_landed:

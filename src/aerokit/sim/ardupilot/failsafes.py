@@ -103,8 +103,6 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.is_ground_station_lost = False
         self.has_estimator_failed = False
         self.is_radio_lost = False  # A lost radio also prevents arming.
-        self.ground_station_seen_at: float = math.nan
-        """Time of the last heartbeat, RC override or MANUAL_CONTROL of the ground station MAV_GCS_SYSID."""
         self.radio_received_at: float = math.nan  # Time of the last RC pulses or overrides.
 
     def start(self) -> None:
@@ -129,7 +127,7 @@ class ArduPilotFailsafes(Generic[HostT]):
     @property
     def ground_station_silence(self) -> float:
         """Seconds since the ground station was last received. NaN before the first time."""
-        return self.vehicle.now - self.ground_station_seen_at
+        return self.vehicle.now - self.vehicle.ground_station_seen_at
 
     def update(self) -> None:
         self.battery.update()
@@ -140,10 +138,6 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     def warn(self, text: str, severity: int = MavSeverity.WARNING) -> None:
         self.vehicle.send_text(severity, text)
-
-    def change_to(self, *modes: int) -> bool:
-        """Change to the first mode that is not refused. Return False if all modes are refused."""
-        return any(self.vehicle.set_mode(mode) for mode in modes)
 
 
 _CHECK_INTERVAL_S = 1.0
@@ -321,6 +315,8 @@ class ArduPilotArming(Generic[HostT]):
 
     def on_armed(self) -> None: ...
 
+    def on_disarmed(self) -> None: ...
+
     def _reasons_not_to_arm(self, *, force: bool) -> list[str]:
         if force and self.vehicle.is_initialised:
             return self.mandatory_reasons()
@@ -333,12 +329,14 @@ class ArduPilotArming(Generic[HostT]):
             return True
         if not self.needs_arming:  # ARMING_REQUIRE 0 keeps the vehicle armed for ever.
             return False
-        if not vehicle.is_landed and not force:
+        may_be_flying = vehicle.KIND in ("copter", "plane") and not vehicle.is_landed
+        if may_be_flying and not force:
             return False
         vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)
         vehicle.motors.set_armed(armed=False)
         vehicle.mission.on_disarmed()
+        self.on_disarmed()
         return True
 
 

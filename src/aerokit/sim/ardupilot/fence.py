@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import ClassVar, Generic
 
 from aerokit.mavlink import messages as m
@@ -238,9 +237,6 @@ class ArduPilotFence(Generic[HostT]):
                 self._new_breach_m.pop(kind, None)
 
     def act(self, new_breaches: int) -> None: ...
-
-    def enter_first_accepted(self, modes: Sequence[int]) -> None:
-        self.caused_mode = any(self.vehicle.set_mode(mode) for mode in modes)  # stops at the first accepted mode
 
     def on_cleared(self) -> None: ...
 

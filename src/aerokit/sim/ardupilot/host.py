@@ -152,8 +152,6 @@ _ARMING_DELAY_S = 2.0
 _SPOOL_UP_S = 1.3
 _SPOOL_DOWN_S = 1.1
 _HOVER_THROTTLE, _IDLE_THROTTLE = 0.36, 0.05
-_ELECTRONICS_A = 0.08  # current of the electronics while armed
-_AMPERES_AT_FULL = 78.0
 _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 
 
@@ -162,6 +160,10 @@ class ArduPilotMotors:
 
     ``spool`` is 0 for idle or stopped motors and 1 for motors that can lift. It rises while ``spool_up_requested``.
     """
+
+    ELECTRONICS_A: ClassVar[float] = 0.08
+    """Current of the electronics while armed."""
+    AMPERES_AT_FULL: ClassVar[float] = 78.0
 
     def __init__(self, vehicle: Any) -> None:
         self.vehicle = vehicle
@@ -183,8 +185,8 @@ class ArduPilotMotors:
 
     @property
     def current_a(self) -> float:
-        electronics_a = _ELECTRONICS_A if self.is_armed else 0.0
-        return electronics_a + self.throttle * _AMPERES_AT_FULL
+        electronics_a = self.ELECTRONICS_A if self.is_armed else 0.0
+        return electronics_a + abs(self.throttle) * self.AMPERES_AT_FULL
 
     @property
     def pwm(self) -> int:
@@ -260,10 +262,6 @@ class ArduPilotRadioHost(Protocol):
     def override(self, pulses: Mapping[int, int]) -> None: ...
 
 
-class ArduPilotFailsafesHost(Protocol):
-    ground_station_seen_at: float
-
-
 class ArduPilotFenceHost(Protocol):
     def update(self) -> None: ...
     def on_armed(self) -> None: ...
@@ -291,18 +289,16 @@ class ArduPilotHost(SimulatedAutopilot):
     uid: bytes
     motors: ArduPilotMotors
     mode: ArduPilotMode
+    guided: GuidedMode
+    ground_station_seen_at: float
+    """Time of the last heartbeat, RC override or MANUAL_CONTROL of the ground station MAV_GCS_SYSID; NaN before."""
     is_initialised: bool
     is_landed: bool
     navigation: ArduPilotNavigationHost
     mission: ArduPilotMissionHost
     missions: ArduPilotMissionsHost
-    failsafes: ArduPilotFailsafesHost
     fence: ArduPilotFenceHost
     rc: ArduPilotRadioHost
-
-    @property
-    def guided(self) -> GuidedMode:
-        raise NotImplementedError
 
     @property
     def is_armed(self) -> bool:

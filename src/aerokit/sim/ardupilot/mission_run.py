@@ -109,7 +109,7 @@ class MissionMode(ArduPilotMode):
             handler(item)
         return handler is not None
 
-    def _wait(self, _: MissionItem) -> None:
+    def _wait(self, item: MissionItem) -> None:
         self._condition_started_at = self.vehicle.now
 
     def _has_waited(self, item: MissionItem) -> bool:

@@ -51,15 +51,10 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
         return [text for failed, text in checks if failed]
 
 
-_FULL_AMPERES = 25.0
-
-
 class PlaneEngine(ArduPilotMotors):
     """The engine of a plane, whose throttle is that of the motion model."""
 
-    @property
-    def current_a(self) -> float:
-        return self.throttle * _FULL_AMPERES
+    ELECTRONICS_A, AMPERES_AT_FULL = 0.0, 25.0
 
     def update(self, dt: float, *, landed: bool) -> None:
         self.throttle: float = self.vehicle.motion.throttle if self.is_armed and not landed else 0.0
@@ -105,6 +100,8 @@ class SimulatedPlane(PlaneHost):
     rotors, parachutes.
     """
 
+    guided: PlaneGuided  # pyright: ignore[reportIncompatibleVariableOverride]
+
     KIND = "plane"
     FIRMWARE = "ArduPlane"
     MAV_TYPE = MavType.FIXED_WING
@@ -144,13 +141,6 @@ class SimulatedPlane(PlaneHost):
         if number in _LIFTING_MODES:
             return MavSeverity.INFO, "Q_ENABLE 0"
         return super().text_for_unknown_mode(number)
-
-    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
-        return "Flight mode change failed"
-
-    @property
-    def guided(self) -> PlaneGuided:
-        return self.mode_of(PlaneGuided)
 
     @property
     def base_mode(self) -> int:

@@ -174,12 +174,12 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             if self._is_in_take_off and not acts_in_take_off:
                 self._is_long_pending = True  # `FS_LONG_ACTN` is executed after the initial climb.
             else:  # Action 0 returns to launch.
-                self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
+                plane.enter_first_accepted(*_LONG_MODES.get(action or _LONG_RTL, ()))
         elif mode == PlaneMode.RTL:  # The plane returns already, so only actions that land change the mode.
             if action in (_LONG_AUTO, _LONG_AUTOLAND):
-                self.change_to(*_LONG_MODES[action])
+                plane.enter_first_accepted(*_LONG_MODES[action])
         elif mode in (PlaneMode.AUTO, PlaneMode.GUIDED) and not plane.mode.is_landing:
-            self.change_to(*_LONG_MODES.get(action, ()))  # Action 0 changes nothing.
+            plane.enter_first_accepted(*_LONG_MODES.get(action, ()))  # Action 0 changes nothing.
         self.warn(f"{'GCS' if state == _GCS else 'RC Long'} Failsafe On: {plane.mode.name}")
 
     @property
@@ -203,7 +203,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             if lands and self._land_by_mission():
                 return
             preferred = (PlaneMode.AUTOLAND,) if action == _AUTOLAND_OR_RTL else ()
-            self.change_to(*preferred, PlaneMode.RTL)
+            self.vehicle.enter_first_accepted(*preferred, PlaneMode.RTL)
 
     def refuse_termination(self) -> None:
         text = "AFS not enabled, can't terminate the vehicle"
@@ -293,5 +293,5 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
 
     def _turn_back(self, mode_before: int, *modes: int) -> None:
-        self.enter_first_accepted(modes)
+        self.caused_mode = self.vehicle.enter_first_accepted(*modes)
         self._mode_before = mode_before

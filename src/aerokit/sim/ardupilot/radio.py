@@ -98,7 +98,7 @@ class ArduPilotRadio:
         sender_system, _component = sender_of(override)
         if sender_system != vehicle.parameters["MAV_GCS_SYSID"]:
             return
-        vehicle.failsafes.ground_station_seen_at = vehicle.now
+        vehicle.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
             value = getattr(override, f"chan{index + 1}_raw")
             is_upper = index >= len(self._sticks)  # one of the channels 9 to 16
@@ -129,7 +129,7 @@ class ArduPilotJoystick:
         if sender_system != vehicle.parameters["MAV_GCS_SYSID"] or axes.target != vehicle.system_id:
             return
         vehicle.rc.override(self.sticks(axes))
-        vehicle.failsafes.ground_station_seen_at = vehicle.now
+        vehicle.ground_station_seen_at = vehicle.now
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
         """Return the commanded pulses in microseconds, by channel index. 0 releases a channel."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from aerokit.mavlink.enums import FenceMitigate, MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, RoverMode
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
-from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors, ConditionTimer
+from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMotors, ConditionTimer
 from aerokit.sim.ardupilot.radio import RoverJoystick
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverGuided, RoverHost
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
@@ -47,15 +47,11 @@ class RoverArming(ArduPilotArming[RoverHost]):
     def on_armed(self) -> None:
         self.vehicle.path.reset()
 
-    def disarm(self, *, force: bool = True) -> bool:
-        rover, was_armed = self.vehicle, self.vehicle.is_armed
-        # A rover disarms even while driving, so `force` has no effect.
-        if not super().disarm(force=True):
-            return False
+    def on_disarmed(self) -> None:
         # The current place becomes home if no command has set home.
-        if was_armed and rover.navigation.home is not None and not rover.navigation.home_is_locked:
+        rover = self.vehicle
+        if rover.navigation.home is not None and not rover.navigation.home_is_locked:
             rover.navigation.set_home(rover.motion.place, lock=False)
-        return True
 
 
 # Values of FS_ACTION, of FENCE_ACTION and of the battery actions.
@@ -123,7 +119,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     def _check_ground_station(self) -> None:
         parameters = self.vehicle.parameters
-        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
+        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.vehicle.ground_station_seen_at):
             return
         self.is_ground_station_lost: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
         self._update_link(_GCS, is_lost=self.is_ground_station_lost)
@@ -164,7 +160,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
         else:
-            self.change_to(*_MODES.get(action, ()))
+            self.vehicle.enter_first_accepted(*_MODES.get(action, ()))
 
     def _check_estimator(self) -> None:
         rover = self.vehicle
@@ -219,18 +215,13 @@ class RoverFence(ArduPilotFence[RoverHost]):
         elif self.action == _TERMINATE:
             self.vehicle.arming.disarm()
         else:
-            self.enter_first_accepted(_MODES.get(self.action, ()))
-
-
-_AMPERES_AT_FULL = 16.0
+            self.caused_mode = self.vehicle.enter_first_accepted(*_MODES.get(self.action, ()))
 
 
 class RoverMotors(ArduPilotMotors):
     """The motor that drives the wheels."""
 
-    @property
-    def current_a(self) -> float:
-        return abs(self.throttle) * _AMPERES_AT_FULL
+    ELECTRONICS_A, AMPERES_AT_FULL = 0.0, 16.0
 
     def update(self, dt: float, *, landed: bool) -> None:
         motion = self.vehicle.motion
@@ -251,6 +242,8 @@ class SimulatedRover(RoverHost):
 
     Not simulated: boats, driving in circles, braking before a fence.
     """
+
+    guided: RoverGuided  # pyright: ignore[reportIncompatibleVariableOverride]
 
     KIND = "rover"
     FIRMWARE = "ArduRover"
@@ -286,16 +279,9 @@ class SimulatedRover(RoverHost):
         return self.mode.number == RoverMode.HOLD
 
     @property
-    def guided(self) -> RoverGuided:
-        return self.mode_of(RoverGuided)
-
-    @property
     def base_mode(self) -> int:
         manual_input = MavModeFlag.MANUAL_INPUT_ENABLED if self.mode.name in _MANUAL_INPUT else 0
         return super().base_mode | manual_input
-
-    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
-        return "Flight mode change failed"
 
     def make_commands(self) -> dict[int, CommandHandler]:
         return {

@@ -34,9 +34,6 @@ class SubArming(ArduPilotArming[SubHost]):
             return ["Must assign a disarm or arm_toggle button or disarm aux function"]
         return super().reasons()
 
-    def disarm(self, *, force: bool = True) -> bool:
-        return super().disarm(force=True)
-
     def _has_disarm_button(self) -> bool:
         parameters = self.vehicle.parameters
         prefixes = [f"BTN{number}_" for number in _BUTTONS if f"BTN{number}_FUNCTION" in parameters]
@@ -122,7 +119,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     def _check_ground_station(self) -> None:
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_GCS_ENABLE"])
-        if not action or math.isnan(self.ground_station_seen_at):
+        if not action or math.isnan(self.vehicle.ground_station_seen_at):
             return
         if self.ground_station_silence < sub.parameters["FS_GCS_TIMEOUT"]:
             if self.is_ground_station_lost:
@@ -220,6 +217,8 @@ class SimulatedSub(SubHost):
     the surface.
     """
 
+    guided: SubGuided  # pyright: ignore[reportIncompatibleVariableOverride]
+
     KIND = "sub"
     FIRMWARE = "ArduSub"
     MAV_TYPE = MavType.SUBMARINE
@@ -249,10 +248,6 @@ class SimulatedSub(SubHost):
     @property
     def is_standby(self) -> bool:
         return not self.motors.is_armed
-
-    @property
-    def guided(self) -> SubGuided:
-        return self.mode_of(SubGuided)
 
     def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         if reason == "requires position":
