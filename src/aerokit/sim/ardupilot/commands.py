@@ -55,7 +55,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         # Only the first pulse is simulated, which sets the servo as DO_SET_SERVO does.
         Cmd.DO_REPEAT_SERVO: lambda command: vehicle.accessories.set_servo(command),
         Cmd.DO_SET_RELAY: lambda command: vehicle.accessories.set_relay(command),
-        Cmd.DO_REPEAT_RELAY: lambda command: vehicle.accessories.repeat_relay(command),
+        Cmd.DO_REPEAT_RELAY: lambda command: vehicle.accessories.set_relay(command),
         Cmd.DO_AUX_FUNCTION: lambda command: vehicle.accessories.switch(command),
         Cmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
         Cmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from itertools import islice
-from typing import Protocol
 
 from aerokit.mavlink.enums import CopterMode, MavFrame, MavSeverity, SpeedType
 from aerokit.mavlink.enums import MavCmd as Cmd
@@ -27,12 +26,7 @@ _RAISED_THROTTLE_PWM = 1100
 _TURN_SHARE_OF_ACCELERATION = 0.7
 
 
-class _Leg(Protocol):
-    """The manoeuvre of a navigation command. `update` sets the motion targets for the next ``dt`` seconds."""
-
-    def update(self, dt: float) -> None: ...
-    @property
-    def is_complete(self) -> bool: ...
+# A leg is the manoeuvre of a navigation command. Its `update` sets the motion targets for the next `dt` seconds.
 
 
 class _FlyLeg:
@@ -182,7 +176,8 @@ class CopterAuto(MissionMode):
         super().__init__(copter)
         self.climb: float = 0.0  # Maximum climb rate in m/s.
         self.descent: float = 0.0  # Maximum sink rate in m/s.
-        self._leg: _Leg | None = None  # None while the copter holds its position.
+        # Manoeuvre of the present navigation command; None while the copter holds its position.
+        self._leg: _FlyLeg | _CircleLeg | _ClimbLeg | _ReturnLeg | _DescendLeg | None = None
         self._last_reached = 0  # index of the command to report in MISSION_ITEM_REACHED; 0 if there is none
         self._reached_at: float | None = None  # None until the copter reaches the waypoint.
         self._delay_until = 0.0

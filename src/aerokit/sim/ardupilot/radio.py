@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavResult
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.ardupilot.host import (
     RC_PITCH,
     RC_ROLL,
@@ -225,14 +225,10 @@ class AuxiliaryOutputs:
     def set_relay(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 < self.relay_count:
             return MavResult.FAILED
-        bit = 1 << to_int(command.param1)
-        self.relays = self.relays | bit if command.param2 else self.relays & ~bit
+        if command.command == MavCmd.DO_SET_RELAY:  # After DO_REPEAT_RELAY, the relay has its previous state again.
+            bit = 1 << to_int(command.param1)
+            self.relays = self.relays | bit if command.param2 else self.relays & ~bit
         return MavResult.ACCEPTED
-
-    def repeat_relay(self, command: ReceivedCommand) -> int:
-        # At the end of the repetitions, the relay has its previous state again.
-        is_valid = 0 <= command.param1 < self.relay_count
-        return MavResult.ACCEPTED if is_valid else MavResult.FAILED
 
     def switch(self, command: ReceivedCommand) -> int:
         function = to_int(command.param1)
