@@ -46,8 +46,20 @@ class MissionCommand(NamedTuple):
     item: MissionItem
 
 
+class SupportedCommand(NamedTuple):
+    """How a mode executes a mission command: by default, it does nothing and is complete at once."""
+
+    start: Callable[[MissionItem], None] = lambda _: None
+    is_done: Callable[[int, MissionItem], bool] = lambda _index, _item: True
+    """Called at every tick with the index of the command and the command. Returns True once it is complete."""
+
+
+def never(_index: int, _item: MissionItem) -> bool:
+    return False
+
+
 class MissionMode(ArduPilotMode):
-    """Base of the AUTO modes. A subclass adds the mission commands that it supports to ``handlers``."""
+    """Base of the AUTO modes. A subclass adds the mission commands that it supports to ``commands``."""
 
     needs_mission = True
     can_change_speed = True
@@ -60,10 +72,10 @@ class MissionMode(ArduPilotMode):
         self.is_paused: bool = False
         self.is_waiting_for_origin: bool = False  # True until the mission starts, which needs the estimator's origin
         self._condition_started_at = 0.0
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            Cmd.CONDITION_DELAY: self._wait,
-            Cmd.DO_SET_HOME: self._set_home,
-            Cmd.DO_FENCE_ENABLE: lambda _: None,  # has no effect
+        self.commands: dict[int, SupportedCommand] = {
+            Cmd.CONDITION_DELAY: SupportedCommand(self._wait, self._has_waited),
+            Cmd.DO_SET_HOME: SupportedCommand(self._set_home),
+            Cmd.DO_FENCE_ENABLE: SupportedCommand(),
         }
 
     def on_disarmed(self) -> None:
@@ -104,15 +116,21 @@ class MissionMode(ArduPilotMode):
 
     def start_command(self, item: MissionItem) -> bool:
         """Start a mission command. Return False to skip a command that is not supported."""
-        handler = self.handlers.get(item.command)
-        if handler is not None:
-            handler(item)
-        return handler is not None
+        command = self.commands.get(item.command)
+        if command is not None:
+            command.start(item)
+        return command is not None
+
+    def _is_done(self, index: int, item: MissionItem) -> bool:
+        if item.command not in self.commands:
+            self.vehicle.send_text(MavSeverity.WARNING, f"Skipping invalid cmd #{item.command}")
+            return True
+        return self.commands[item.command].is_done(index, item)
 
     def _wait(self, item: MissionItem) -> None:
         self._condition_started_at = self.vehicle.now
 
-    def _has_waited(self, item: MissionItem) -> bool:
+    def _has_waited(self, _index: int, item: MissionItem) -> bool:
         return bool(self.vehicle.now - self._condition_started_at > max(0.0, item.param1))
 
     def _set_home(self, item: MissionItem) -> None:
@@ -124,10 +142,6 @@ class MissionMode(ArduPilotMode):
             point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:
             vehicle.navigation.set_home(point, lock=False)
-
-    def warn_if_unknown(self, item: MissionItem) -> None:
-        if item.command not in self.handlers:
-            self.vehicle.send_text(MavSeverity.WARNING, f"Skipping invalid cmd #{item.command}")
 
 
 def is_navigation(item: MissionItem) -> bool:

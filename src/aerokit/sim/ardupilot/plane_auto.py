@@ -16,7 +16,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES, GuidedMode
-from aerokit.sim.ardupilot.mission_run import MissionMode
+from aerokit.sim.ardupilot.mission_run import MissionMode, SupportedCommand, never
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import ReceivedCommand, constrained, to_int
@@ -41,15 +41,20 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._turned_rad = 0.0  # angle flown around the circle
         self._last_bearing = 0.0  # bearing from the center of the circle at the last tick
         self._leg_start: Ned = (0.0, 0.0, 0.0)  # start of the straight line to the current waypoint
-        self.handlers |= {
-            Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
-            **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
-            **dict.fromkeys((Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME), self._start_loiter),
-            **dict.fromkeys((Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT), self._start_loiter),
-            Cmd.NAV_LAND: self._start_landing,
-            Cmd.NAV_RETURN_TO_LAUNCH: self._return,
-            Cmd.DO_CHANGE_SPEED: self._change_speed,
-            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START), lambda _: None),
+        self.commands |= {
+            Cmd.NAV_TAKEOFF: SupportedCommand(lambda item: self._go(item, _CLIMB), self._has_climbed),
+            **dict.fromkeys(
+                (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT),
+                SupportedCommand(lambda item: self._go(item, _FLY), self._has_passed),
+            ),
+            Cmd.NAV_LOITER_UNLIM: SupportedCommand(self._start_loiter, never),
+            Cmd.NAV_LOITER_TIME: SupportedCommand(self._start_loiter, self._has_circled_for_time),
+            Cmd.NAV_LOITER_TURNS: SupportedCommand(self._start_loiter, self._has_turned),
+            Cmd.NAV_LOITER_TO_ALT: SupportedCommand(self._start_loiter, self._is_at_height),
+            Cmd.NAV_LAND: SupportedCommand(self._start_landing, never),
+            Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(self._return, never),
+            Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START), SupportedCommand()),
         }
 
     @property
@@ -127,28 +132,21 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.info("Mission complete, changing mode to RTL")
             self.vehicle.set_mode(PlaneMode.RTL)
 
-    def _is_done(self, index: int, item: MissionItem) -> bool:
-        plane, command = self.vehicle, item.command
-        if command == Cmd.NAV_TAKEOFF:
-            is_altitude_reached = plane.wing.down <= self._place_down
-            return self._report_if(is_altitude_reached, f"Takeoff complete at {plane.altitude_m:.2f}m")
-        if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
-            return self._has_passed(index)
-        if command == Cmd.NAV_LOITER_TIME:
-            # Before the plane has reached the circle, the time is NaN, and the comparison is false.
-            time_on_circle_s = plane.now - self._on_circle_since
-            return self._report_if(time_on_circle_s >= item.param1, "Loiter time complete")
-        if command == Cmd.NAV_LOITER_TURNS:
-            return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
-        if command == Cmd.NAV_LOITER_TO_ALT:
-            is_at_height = abs(plane.wing.down - self._place_down) < _REACHED_HEIGHT_M
-            return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
-        if command == Cmd.CONDITION_DELAY:
-            return self._has_waited(item)
-        if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
-            return False
-        self.warn_if_unknown(item)
-        return True
+    def _has_climbed(self, _index: int, _item: MissionItem) -> bool:
+        plane = self.vehicle
+        return self._report_if(plane.wing.down <= self._place_down, f"Takeoff complete at {plane.altitude_m:.2f}m")
+
+    def _has_circled_for_time(self, _index: int, item: MissionItem) -> bool:
+        # Before the plane has reached the circle, the time is NaN, and the comparison is false.
+        time_on_circle_s = self.vehicle.now - self._on_circle_since
+        return self._report_if(time_on_circle_s >= item.param1, "Loiter time complete")
+
+    def _has_turned(self, _index: int, item: MissionItem) -> bool:
+        return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
+
+    def _is_at_height(self, _index: int, _item: MissionItem) -> bool:
+        is_at_height = abs(self.vehicle.wing.down - self._place_down) < _REACHED_HEIGHT_M
+        return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
 
     @property
     def _place_down(self) -> float:
@@ -161,7 +159,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.info(text)
         return is_complete
 
-    def _has_passed(self, index: int) -> bool:
+    def _has_passed(self, index: int, _item: MissionItem) -> bool:
         assert self._place is not None
         wing = self.vehicle.wing
         north, east, _ = self._place

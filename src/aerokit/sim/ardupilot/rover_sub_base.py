@@ -17,7 +17,7 @@ from aerokit.mavlink.messages import (
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.host import GuidedMode
-from aerokit.sim.ardupilot.mission_run import MissionMode, place_of
+from aerokit.sim.ardupilot.mission_run import MissionMode, SupportedCommand, place_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, PositionTarget, ReceivedCommand, Setpoint, is_finite, rotated
@@ -171,10 +171,7 @@ class RoverSubVehicle(ArduPilotVehicle):
 
 _WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME})
 
-_WITHOUT_EFFECT = (
-    Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_GUIDED_LIMITS,
-    Cmd.CONDITION_DISTANCE,
-)  # fmt: skip
+_WITHOUT_EFFECT = (Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_GUIDED_LIMITS)
 
 
 class RoverSubAuto(MissionMode):
@@ -187,11 +184,20 @@ class RoverSubAuto(MissionMode):
         self._stops = True  # True if the vehicle stops at `_place`
         self._reached_at: float | None = None  # time of arrival at `_place`; None before
         self._wait_until = 0.0  # end of a delay command
-        self.handlers |= {
-            **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_RETURN_TO_LAUNCH), self._go),
-            **dict.fromkeys((Cmd.NAV_DELAY, Cmd.CONDITION_DELAY), self._wait),
-            Cmd.DO_CHANGE_SPEED: self._change_speed,
-            **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
+        self.commands |= {
+            **dict.fromkeys(_WAYPOINTS, SupportedCommand(self._go, self._has_stayed)),
+            Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(
+                self._go, lambda *_: self._place is None or self.has_arrived(self._place)
+            ),
+            **dict.fromkeys(
+                (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY),
+                SupportedCommand(self._wait, lambda *_: vehicle.now >= self._wait_until),
+            ),
+            Cmd.CONDITION_DISTANCE: SupportedCommand(
+                is_done=lambda _, item: self.distance_to_destination < item.param1
+            ),
+            Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+            **dict.fromkeys(_WITHOUT_EFFECT, SupportedCommand()),
         }
 
     def travel(self, place: Ned, *, stops: bool) -> None:
@@ -237,20 +243,6 @@ class RoverSubAuto(MissionMode):
         if self.vehicle.KIND == "rover":  # The rover stops, because only MIS_DONE_BEHAVE 0 (hold) is simulated.
             self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
 
-    def _is_done(self, index: int, item: MissionItem) -> bool:
-        command, now = item.command, self.vehicle.now
-        if command in _WAYPOINTS:
-            # NAV_LOITER_UNLIM never ends, but its arrival is reported.
-            return self._has_stayed(index, item) and command != Cmd.NAV_LOITER_UNLIM
-        if command == Cmd.NAV_RETURN_TO_LAUNCH:
-            return self._place is None or self.has_arrived(self._place)
-        if command in (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY):
-            return now >= self._wait_until
-        if command == Cmd.CONDITION_DISTANCE:
-            return self.distance_to_destination < item.param1
-        self.warn_if_unknown(item)
-        return True
-
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
         if self._place is None:
             return False
@@ -261,7 +253,8 @@ class RoverSubAuto(MissionMode):
             self._reached_at = now
             self.vehicle.info(self.reached_text(index, item.param1))
         delay_s = max(0.0, item.param1)
-        return now - self._reached_at >= delay_s
+        # NAV_LOITER_UNLIM never ends, but its arrival is reported.
+        return now - self._reached_at >= delay_s and item.command != Cmd.NAV_LOITER_UNLIM
 
     def _go(self, item: MissionItem) -> None:
         vehicle = self.vehicle
