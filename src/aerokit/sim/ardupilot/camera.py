@@ -162,9 +162,7 @@ class ArduPilotCamera:
             foc_len=0.0, flags=CameraFeedbackFlags.PHOTO, completed_captures=0,
         )  # fmt: skip
 
-    def information(self) -> m.CameraInformation | None:
-        if not self.is_fitted:
-            return None
+    def information(self) -> m.CameraInformation:
         return m.CameraInformation(
             time_boot_ms=self._vehicle.time_boot_ms, vendor_name=bytes(32), model_name=bytes(32), firmware_version=0,
             focal_length=0.0, sensor_size_h=0.0, sensor_size_v=0.0, resolution_h=0, resolution_v=0, lens_id=0, flags=0,
@@ -172,14 +170,10 @@ class ArduPilotCamera:
             gimbal_device_id=int(self._gimbal.is_fitted),
         )  # fmt: skip
 
-    def settings(self) -> m.CameraSettings | None:
-        if not self.is_fitted:
-            return None
+    def settings(self) -> m.CameraSettings:
         return m.CameraSettings(self._vehicle.time_boot_ms, mode_id=0, zoomLevel=math.nan, focusLevel=math.nan)
 
-    def capture_status(self) -> m.CameraCaptureStatus | None:
-        if not self.is_fitted:
-            return None
+    def capture_status(self) -> m.CameraCaptureStatus:
         # `remaining` is -1 during an unlimited series, which the firmware reports as idle (AP_Camera_Backend.cpp).
         is_series_reported = self.remaining > 0
         return m.CameraCaptureStatus(

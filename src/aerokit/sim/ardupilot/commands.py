@@ -51,12 +51,12 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     return {
         **handlers,
         Cmd.DO_GRIPPER: lambda command: vehicle.devices.grip(command),
-        Cmd.DO_SET_SERVO: lambda command: vehicle.accessories.set_servo(command),
+        Cmd.DO_SET_SERVO: lambda command: vehicle.devices.set_servo(command),
         # Only the first pulse is simulated, which sets the servo as DO_SET_SERVO does.
-        Cmd.DO_REPEAT_SERVO: lambda command: vehicle.accessories.set_servo(command),
-        Cmd.DO_SET_RELAY: lambda command: vehicle.accessories.set_relay(command),
-        Cmd.DO_REPEAT_RELAY: lambda command: vehicle.accessories.set_relay(command),
-        Cmd.DO_AUX_FUNCTION: lambda command: vehicle.accessories.switch(command),
+        Cmd.DO_REPEAT_SERVO: lambda command: vehicle.devices.set_servo(command),
+        Cmd.DO_SET_RELAY: lambda command: vehicle.devices.set_relay(command),
+        Cmd.DO_REPEAT_RELAY: lambda command: vehicle.devices.set_relay(command),
+        Cmd.DO_AUX_FUNCTION: lambda command: vehicle.devices.switch(command),
         Cmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
         Cmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
         Cmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),

@@ -272,9 +272,7 @@ class ArduPilotGimbal:
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
-    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
-        if not self.is_fitted:
-            return None
+    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus:
         # The reported yaw is relative to the nose, even with YAW_LOCK.
         flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
         if self.mode == MavMountMode.RETRACT:
@@ -292,9 +290,7 @@ class ArduPilotGimbal:
             gimbal_device_id=_DEVICE_ID,
         )  # fmt: skip
 
-    def manager_information(self) -> m.GimbalManagerInformation | None:
-        if not self.is_fitted:
-            return None
+    def manager_information(self) -> m.GimbalManagerInformation:
         limits = (
             math.radians(self.setting(f"MNT1_{axis}_{end}"))
             for axis in ("ROLL", "PITCH", "YAW")
@@ -302,9 +298,7 @@ class ArduPilotGimbal:
         )
         return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
-    def manager_status(self) -> m.GimbalManagerStatus | None:
-        if not self.is_fitted:
-            return None
+    def manager_status(self) -> m.GimbalManagerStatus:
         flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
         if self.is_yaw_locked:
             flags |= GimbalManagerFlags.YAW_LOCK

@@ -25,7 +25,7 @@ from aerokit.sim.ardupilot.kinds import BOOT_TIMELINES, BootTimeline, parameters
 from aerokit.sim.ardupilot.mission_run import MissionMode, MissionRun
 from aerokit.sim.ardupilot.mission_server import ArduPilotMissionServer
 from aerokit.sim.ardupilot.navigation import ArduPilotNavigation, SmartPath
-from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio, AuxiliaryOutputs
+from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio
 from aerokit.sim.ardupilot.requests import ArduPilotMessageRequests
 from aerokit.sim.ardupilot.storage import ArduPilotSigning, ArduPilotStorage
 from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
@@ -154,7 +154,6 @@ class ArduPilotVehicle(ArduPilotHost):
         self.ground_station_seen_at: float = math.nan
         self.failsafes: ArduPilotFailsafes[Any] = self.FAILSAFES(self)
         self.arming: ArduPilotArming[Any] = self.ARMING(self, self.failsafes, self.calibrations.compasses)
-        self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
         self.devices: ArduPilotDevices = ArduPilotDevices(self, self.arming)
         self.fence: ArduPilotFence[Any] = self.FENCE(self)
         self.gimbal: ArduPilotGimbal = ArduPilotGimbal(self)
