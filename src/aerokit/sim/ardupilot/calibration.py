@@ -210,7 +210,6 @@ class Calibrations:
             MavCmd.DO_START_MAG_CAL: self.compasses.start,
             MavCmd.DO_ACCEPT_MAG_CAL: self.compasses.accept,
             MavCmd.DO_CANCEL_MAG_CAL: self.compasses.cancel,
-            MavCmd.FIXED_MAG_CAL_YAW: lambda _: MavResult.ACCEPTED,
         }
 
     def _calibrate(self, command: ReceivedCommand) -> int | CommandProgress:

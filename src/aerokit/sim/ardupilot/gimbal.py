@@ -61,8 +61,8 @@ class ArduPilotGimbal:
     """The gimbal: its mode, its target and the component in control. :attr:`angles` is the direction of the gimbal."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
-        self._vehicle = vehicle
-        self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))  # A MAV_MOUNT_MODE.
+        self._vehicle, self._parameters = vehicle, vehicle.parameters
+        self.mode: int = int(self._parameters["MNT1_DEFLT_MODE"])  # A MAV_MOUNT_MODE.
         self.is_yaw_locked: bool = False  # True if the pilot's stick controls yaw relative to north.
         self.in_control: tuple[int, int] = (0, 0)  # System id and component id that control the gimbal.
         self._target = MountTarget()
@@ -75,10 +75,7 @@ class ArduPilotGimbal:
 
     @property
     def is_fitted(self) -> bool:
-        return self._vehicle.parameters["MNT1_TYPE"] != 0
-
-    def setting(self, name: str) -> float:
-        return self._vehicle.parameters[name]
+        return self._parameters["MNT1_TYPE"] != 0
 
     @property
     def angles(self) -> tuple[float, float, float]:
@@ -100,7 +97,7 @@ class ArduPilotGimbal:
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
             mode_name = MavMountMode(self.mode).name
-            roll, pitch, yaw = (self.setting(f"MNT1_{mode_name}_{axis}") for axis in "XYZ")
+            roll, pitch, yaw = (self._parameters[f"MNT1_{mode_name}_{axis}"] for axis in "XYZ")
             return MountTarget(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
             return self._update_target_for(self._region)
@@ -135,10 +132,10 @@ class ArduPilotGimbal:
         return math.remainder(target.yaw - math.degrees(self._vehicle.motion.yaw), 360.0)
 
     def _limited(self, axis: str, angle: float) -> float:
-        return max(self.setting(f"MNT1_{axis}_MIN"), min(self.setting(f"MNT1_{axis}_MAX"), angle))
+        return max(self._parameters[f"MNT1_{axis}_MIN"], min(self._parameters[f"MNT1_{axis}_MAX"], angle))
 
     def _middle(self, axis: str) -> float:
-        return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
+        return (self._parameters[f"MNT1_{axis}_MIN"] + self._parameters[f"MNT1_{axis}_MAX"]) / 2.0
 
     def set_mode(self, mode: int) -> None:
         """Set a MAV_MOUNT_MODE. Unknown values are ignored."""
@@ -169,7 +166,7 @@ class ArduPilotGimbal:
         if place is not None:
             self.set_mode(MavMountMode.GPS_POINT)
         elif self.mode == MavMountMode.GPS_POINT:
-            self.set_mode(int(self.setting("MNT1_DEFLT_MODE")))
+            self.set_mode(int(self._parameters["MNT1_DEFLT_MODE"]))
 
     def follow(self, system_id: int) -> None:
         """Point at another vehicle once its position is received."""
@@ -292,7 +289,7 @@ class ArduPilotGimbal:
 
     def manager_information(self) -> m.GimbalManagerInformation:
         limits = (
-            math.radians(self.setting(f"MNT1_{axis}_{end}"))
+            math.radians(self._parameters[f"MNT1_{axis}_{end}"])
             for axis in ("ROLL", "PITCH", "YAW")
             for end in ("MIN", "MAX")
         )

@@ -260,6 +260,7 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
     missing = 0  # number of vertices that must still follow
     has_return_point = False
     for item in items:
+        number = _TYPE_NUMBERS[item.command]
         if item.command in POLYGON_CORNERS:
             if item.param1 < 3:
                 return f"Invalid vertex count ({item.param1:.0f})"
@@ -268,12 +269,12 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
                 vertices = item.param1
                 missing = int(item.param1)
             elif item.command != polygon_type:
-                return f"Received incorrect vertex type (want={_number(polygon_type)} got={_number(item.command)})"
+                return f"Received incorrect vertex type (want={_TYPE_NUMBERS[polygon_type]} got={number})"
             elif item.param1 != vertices:
                 return f"Unexpected vertex count want={vertices:.0f} got={item.param1:.0f}"
             missing -= 1
         elif missing:
-            return f"Received incorrect type (want={_number(polygon_type)} got={_number(item.command)})"
+            return f"Received incorrect type (want={_TYPE_NUMBERS[polygon_type]} got={number})"
         elif item.command in CIRCLES and not item.param1 > 0:
             return "Non-positive circle radius"
         elif item.command == Cmd.NAV_FENCE_RETURN_POINT:
@@ -285,10 +286,6 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
         except ItemRefused:
             return "Bad lat or lon"
     return "Incorrect item count" if missing else None
-
-
-def _number(command: int) -> int:
-    return _TYPE_NUMBERS.get(command, 0)
 
 
 def _storage_needed(items: Sequence[MissionItem]) -> int:
