@@ -169,22 +169,17 @@ class MissionRun:
     def is_running(self) -> bool:
         return self._state == MissionState.ACTIVE
 
-    @property
-    def state(self) -> int:
-        if not self.is_present:
-            return MissionState.NO_MISSION
-        is_paused = self.is_running and self._mode.is_paused
-        return MissionState.PAUSED if is_paused else self._state
-
     def message(self, seq: int | None = None) -> MissionCurrent:
         seq = self.nav_index if seq is None else seq
         total = max(0, self._list.count - 1)  # Home does not count.
-        return MissionCurrent(seq, total, self.state, int(self._vehicle.mode.needs_mission))
+        state = MissionState.PAUSED if self.is_running and self._mode.is_paused else self._state
+        if not self.is_present:
+            state = MissionState.NO_MISSION
+        return MissionCurrent(seq, total, state, int(self._vehicle.mode.needs_mission))
 
     def starts_with_take_off(self) -> bool:
         is_resumed = self.nav_index != 0 and not self._restarts
-        first_index = self.nav_index if is_resumed else _FIRST
-        return self.is_take_off(first_index)
+        return self.is_take_off(self.nav_index if is_resumed else _FIRST)
 
     def is_take_off(self, index: int) -> bool:
         """Return True if the first navigation command from ``index`` on is a take-off. Delays are skipped."""
