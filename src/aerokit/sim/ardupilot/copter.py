@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import (
     CopterMode,
@@ -24,8 +24,11 @@ from aerokit.sim.ardupilot.copter_auto import CopterAuto
 from aerokit.sim.ardupilot.copter_failsafes import CopterArming, CopterFailsafes, CopterFence
 from aerokit.sim.ardupilot.copter_guided import CopterGuided
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer, variant
-from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
+from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.motion import Ned
 
@@ -170,18 +173,18 @@ class SimulatedCopter(CopterHost):
 
     guided: CopterGuided  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    KIND = "copter"
-    FIRMWARE = "ArduCopter"
-    FRAME = "Frame: QUAD/PLUS"
-    MAV_TYPE = MavType.QUADROTOR
-    BASE_FLAGS = _BASE
-    GUIDED_MODES = _GUIDED_MODES
-    CAPABILITIES = 0xFBEF
-    BUILDERS = BUILDERS_OF_KIND["copter"]
-    MODES = _MODES
-    ARMING = CopterArming
-    FAILSAFES = CopterFailsafes
-    FENCE = CopterFence
+    KIND: ClassVar[Kind] = "copter"
+    FIRMWARE: ClassVar[str] = "ArduCopter"
+    FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
+    MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
+    BASE_FLAGS: ClassVar[int] = _BASE
+    GUIDED_MODES: ClassVar[frozenset[str]] = _GUIDED_MODES
+    CAPABILITIES: ClassVar[int] = 0xFBEF
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["copter"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = CopterArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = CopterFailsafes
+    FENCE: ClassVar[type[ArduPilotFence[Any]]] = CopterFence
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return the handlers of the commands that ArduCopter knows."""

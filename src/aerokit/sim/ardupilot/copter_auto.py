@@ -183,27 +183,29 @@ class CopterAuto(MissionMode):
         self._list_version = -1  # version of the command list from which `_upcoming` was read
         # The current and the next navigation commands. They are compared to notice an upload that changes them.
         self._upcoming: tuple[MissionCommand, ...] = ()
-        self.commands |= {
-            **dict.fromkeys(TAKE_OFFS, SupportedCommand(self._take_off, self._has_leg_ended)),
-            **dict.fromkeys(_WAYPOINTS, SupportedCommand(self._fly, self._has_stayed)),
-            Cmd.NAV_LOITER_UNLIM: SupportedCommand(self._fly, never),
-            Cmd.NAV_LOITER_TO_ALT: SupportedCommand(self._fly, self._has_leg_ended),
-            **dict.fromkeys(_LANDINGS, SupportedCommand(self._land, self._land_or_continue)),
-            Cmd.NAV_LOITER_TURNS: SupportedCommand(self._circle, self._has_leg_ended),
-            Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(self._return, self._has_leg_ended),
-            Cmd.NAV_DELAY: SupportedCommand(self._delay, lambda *_: copter.now > self._delay_until),
-            # Param 1 is 1 at the start of the control by a companion computer, and 0 at its end.
-            Cmd.NAV_GUIDED_ENABLE: SupportedCommand(is_done=lambda _, item: item.param1 == 0),
-            Cmd.CONDITION_DISTANCE: SupportedCommand(
-                is_done=lambda _, item: self.distance_to_destination < max(0.0, item.param1)
-            ),
-            Cmd.CONDITION_YAW: SupportedCommand(
-                self._turn, lambda *_: copter.yaw.turn_to_last_heading(_HEADING_REACHED_RAD)
-            ),
-            Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
-            **dict.fromkeys(_ROI_COMMANDS, SupportedCommand(self._look_at)),
-            **dict.fromkeys(_WITHOUT_EFFECT, SupportedCommand()),
-        }
+        self.commands.update(
+            {
+                **dict.fromkeys(TAKE_OFFS, SupportedCommand(self._take_off, self._has_leg_ended)),
+                **dict.fromkeys(_WAYPOINTS, SupportedCommand(self._fly, self._has_stayed)),
+                Cmd.NAV_LOITER_UNLIM: SupportedCommand(self._fly, never),
+                Cmd.NAV_LOITER_TO_ALT: SupportedCommand(self._fly, self._has_leg_ended),
+                **dict.fromkeys(_LANDINGS, SupportedCommand(self._land, self._land_or_continue)),
+                Cmd.NAV_LOITER_TURNS: SupportedCommand(self._circle, self._has_leg_ended),
+                Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(self._return, self._has_leg_ended),
+                Cmd.NAV_DELAY: SupportedCommand(self._delay, lambda *_: copter.now > self._delay_until),
+                # Param 1 is 1 at the start of the control by a companion computer, and 0 at its end.
+                Cmd.NAV_GUIDED_ENABLE: SupportedCommand(is_done=lambda _, item: item.param1 == 0),
+                Cmd.CONDITION_DISTANCE: SupportedCommand(
+                    is_done=lambda _, item: self.distance_to_destination < max(0.0, item.param1)
+                ),
+                Cmd.CONDITION_YAW: SupportedCommand(
+                    self._turn, lambda *_: copter.yaw.turn_to_last_heading(_HEADING_REACHED_RAD)
+                ),
+                Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+                **dict.fromkeys(_ROI_COMMANDS, SupportedCommand(self._look_at)),
+                **dict.fromkeys(_WITHOUT_EFFECT, SupportedCommand()),
+            }
+        )
 
     @property
     def can_arm(self) -> bool:  # type: ignore[override]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from aerokit.mavlink.enums import CopterMode, FenceMitigate, FenceType, MavSeverity
 from aerokit.sim.ardupilot.copter_modes import CopterHost
@@ -18,8 +18,8 @@ _STICK_CENTER, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 class CopterArming(ArduPilotArming[CopterHost]):
     """ArduCopter's arming checks."""
 
-    ARMED_TEXT = "Arming motors"
-    DISARMED_TEXT = "Disarming motors"
+    ARMED_TEXT: ClassVar[str] = "Arming motors"
+    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
     def ahrs_reasons(self) -> Sequence[str]:
         return ()  # `position_reasons` includes these checks, because ArduCopter runs them after the GPS checks.
@@ -114,7 +114,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     Not simulated: failsafes of terrain, vibration and dead reckoning, and the landing sequence of action 6 (AUTO).
     """
 
-    BATTERY_PRIORITIES = (
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
         _TERMINATE, _LAND, _RTL, _SMART_RTL_OR_LAND, _SMART_RTL, _NONE,
     )  # fmt: skip
 
@@ -303,8 +303,8 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 class CopterFence(ArduPilotFence[CopterHost]):
     """ArduCopter's fence. In flight, FENCE_ACTION selects the mode after a breach."""
 
-    PERIOD_S = 0.1
-    MITIGATION = FenceMitigate.NONE
+    PERIOD_S: ClassVar[float] = 0.1
+    MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
         if self.vehicle.is_landed:
@@ -318,7 +318,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
         modes = _FENCE_ACTIONS.get(self.action, _FENCE_ACTIONS[_FENCE_RTL])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        self.caused_mode = self.vehicle.enter_first_accepted(*modes)
+        self.caused_mode: bool = self.vehicle.enter_first_accepted(*modes)
 
     def on_cleared(self) -> None:
         if not self.vehicle.is_landed:

@@ -69,7 +69,7 @@ class CommandList(ItemList):
     """The list of mission commands. Item 0 is home, which the function ``home`` returns at each download."""
 
     name = "Mission"
-    capacity = 650
+    capacity: ClassVar[int] = 650
 
     def __init__(self, home: Callable[[], MissionItem], is_running: Callable[[], bool], kind: Kind) -> None:
         super().__init__()  # The item at index 0 is a placeholder for home.
@@ -132,7 +132,7 @@ class RallyList(ItemList):
     """The list of rally points. Their position, altitude (in whole metres) and altitude frame are stored."""
 
     name = "Rally"
-    capacity = 46
+    capacity: ClassVar[int] = 46
 
     def item(self, seq: int) -> MissionItem | None:
         point = super().item(seq)
@@ -182,7 +182,7 @@ class FenceList(ItemList):
     """The list of fence items. During an upload, `item` still reads the old fence."""
 
     name = "Fence"
-    capacity = _STORAGE_BYTES // _BYTES_PER_POINT
+    capacity: ClassVar[int] = _STORAGE_BYTES // _BYTES_PER_POINT
 
     def __init__(self, on_total: Callable[[int], None]) -> None:
         super().__init__()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import (
     MavCmd,
@@ -18,12 +18,14 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.sim.ardupilot import plane_modes as modes
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.failsafes import ArduPilotArming
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, variant
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided
 from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneModeBase, PlaneNavigatingMode
-from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 
 _SHORT_DISABLED = 3
@@ -54,7 +56,8 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
 class PlaneEngine(ArduPilotMotors):
     """The engine of a plane, whose throttle is that of the motion model."""
 
-    ELECTRONICS_A, AMPERES_AT_FULL = 0.0, 25.0
+    ELECTRONICS_A: ClassVar[float] = 0.0
+    AMPERES_AT_FULL: ClassVar[float] = 25.0
 
     def update(self, dt: float, *, landed: bool) -> None:
         self.throttle: float = self.vehicle.motion.throttle if self.is_armed and not landed else 0.0
@@ -102,18 +105,18 @@ class SimulatedPlane(PlaneHost):
 
     guided: PlaneGuided  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    KIND = "plane"
-    FIRMWARE = "ArduPlane"
-    MAV_TYPE = MavType.FIXED_WING
-    HOME_NEEDS_ORIGIN = False
-    BASE_FLAGS = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
-    CAPABILITIES = 0xF36F
-    BUILDERS = BUILDERS_OF_KIND["plane"]
-    MODES = _MODES
-    ARMING = PlaneArming
-    FAILSAFES = PlaneFailsafes
-    FENCE = PlaneFence
-    MOTORS = PlaneEngine
+    KIND: ClassVar[Kind] = "plane"
+    FIRMWARE: ClassVar[str] = "ArduPlane"
+    MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
+    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
+    BASE_FLAGS: ClassVar[int] = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
+    CAPABILITIES: ClassVar[int] = 0xF36F
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = PlaneArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = PlaneFailsafes
+    FENCE: ClassVar[type[ArduPilotFence[Any]]] = PlaneFence
+    MOTORS: ClassVar[type[ArduPilotMotors]] = PlaneEngine
 
     fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]

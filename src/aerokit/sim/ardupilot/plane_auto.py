@@ -41,21 +41,23 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._turned_rad = 0.0  # angle flown around the circle
         self._last_bearing = 0.0  # bearing from the center of the circle at the last tick
         self._leg_start: Ned = (0.0, 0.0, 0.0)  # start of the straight line to the current waypoint
-        self.commands |= {
-            Cmd.NAV_TAKEOFF: SupportedCommand(lambda item: self._go(item, _CLIMB), self._has_climbed),
-            **dict.fromkeys(
-                (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT),
-                SupportedCommand(lambda item: self._go(item, _FLY), self._has_passed),
-            ),
-            Cmd.NAV_LOITER_UNLIM: SupportedCommand(self._start_loiter, never),
-            Cmd.NAV_LOITER_TIME: SupportedCommand(self._start_loiter, self._has_circled_for_time),
-            Cmd.NAV_LOITER_TURNS: SupportedCommand(self._start_loiter, self._has_turned),
-            Cmd.NAV_LOITER_TO_ALT: SupportedCommand(self._start_loiter, self._is_at_height),
-            Cmd.NAV_LAND: SupportedCommand(self._start_landing, never),
-            Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(self._return, never),
-            Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
-            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START), SupportedCommand()),
-        }
+        self.commands.update(
+            {
+                Cmd.NAV_TAKEOFF: SupportedCommand(lambda item: self._go(item, _CLIMB), self._has_climbed),
+                **dict.fromkeys(
+                    (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT),
+                    SupportedCommand(lambda item: self._go(item, _FLY), self._has_passed),
+                ),
+                Cmd.NAV_LOITER_UNLIM: SupportedCommand(self._start_loiter, never),
+                Cmd.NAV_LOITER_TIME: SupportedCommand(self._start_loiter, self._has_circled_for_time),
+                Cmd.NAV_LOITER_TURNS: SupportedCommand(self._start_loiter, self._has_turned),
+                Cmd.NAV_LOITER_TO_ALT: SupportedCommand(self._start_loiter, self._is_at_height),
+                Cmd.NAV_LAND: SupportedCommand(self._start_landing, never),
+                Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(self._return, never),
+                Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+                **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START), SupportedCommand()),
+            }
+        )
 
     @property
     def is_taking_off(self) -> bool:  # type: ignore[override]

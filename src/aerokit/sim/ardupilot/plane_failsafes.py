@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavMissionType, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.failsafes import ArduPilotFailsafes
@@ -43,7 +44,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     termination.
     """
 
-    BATTERY_PRIORITIES = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -237,7 +238,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     previous mode.
     """
 
-    CIRCLE_BACKUP_M = 100.0
+    CIRCLE_BACKUP_M: ClassVar[float] = 100.0
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -293,5 +294,5 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
 
     def _turn_back(self, mode_before: int, *modes: int) -> None:
-        self.caused_mode = self.vehicle.enter_first_accepted(*modes)
+        self.caused_mode: bool = self.vehicle.enter_first_accepted(*modes)
         self._mode_before = mode_before

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import FenceMitigate, MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, RoverMode
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
-from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMotors, ConditionTimer
-from aerokit.sim.ardupilot.radio import RoverJoystick
+from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors, ConditionTimer
+from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.ardupilot.radio import ArduPilotJoystick, RoverJoystick
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverGuided, RoverHost
-from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import CommandHandler
 from aerokit.sim.motion import SimulatedWind
 from aerokit.sim.vehicle_motion import GroundLimits, GroundMotion
@@ -83,7 +85,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     text is "Radio Failsafe", even if only the ground station is lost.
     """
 
-    BATTERY_PRIORITIES = (
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
         _TERMINATE, _HOLD, _RTL, _SMART_RTL_OR_HOLD, _SMART_RTL, _NONE,
     )  # fmt: skip
 
@@ -204,8 +206,8 @@ class RoverFence(ArduPilotFence[RoverHost]):
     FENCE_ACTION has the values of FS_ACTION. With any action but 0, a rover more than 100 m outside changes to HOLD.
     """
 
-    PERIOD_S = 0.1
-    MITIGATION = FenceMitigate.NONE
+    PERIOD_S: ClassVar[float] = 0.1
+    MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
         if self.action == REPORT_ONLY:
@@ -215,13 +217,14 @@ class RoverFence(ArduPilotFence[RoverHost]):
         elif self.action == _TERMINATE:
             self.vehicle.arming.disarm()
         else:
-            self.caused_mode = self.vehicle.enter_first_accepted(*_MODES.get(self.action, ()))
+            self.caused_mode: bool = self.vehicle.enter_first_accepted(*_MODES.get(self.action, ()))
 
 
 class RoverMotors(ArduPilotMotors):
     """The motor that drives the wheels."""
 
-    ELECTRONICS_A, AMPERES_AT_FULL = 0.0, 16.0
+    ELECTRONICS_A: ClassVar[float] = 0.0
+    AMPERES_AT_FULL: ClassVar[float] = 16.0
 
     def update(self, dt: float, *, landed: bool) -> None:
         motion = self.vehicle.motion
@@ -245,21 +248,21 @@ class SimulatedRover(RoverHost):
 
     guided: RoverGuided  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    KIND = "rover"
-    FIRMWARE = "ArduRover"
-    MAV_TYPE = MavType.GROUND_ROVER
-    HOME_NEEDS_ORIGIN = False
-    REPORTS_HOME = True
-    BASE_FLAGS = MavModeFlag.CUSTOM_MODE_ENABLED
-    GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
-    CAPABILITIES = 0xF1EF
-    BUILDERS = BUILDERS_OF_KIND["rover"]
-    MODES = ROVER_MODES
-    ARMING = RoverArming
-    FAILSAFES = RoverFailsafes
-    FENCE = RoverFence
-    MOTORS = RoverMotors
-    JOYSTICK = RoverJoystick
+    KIND: ClassVar[Kind] = "rover"
+    FIRMWARE: ClassVar[str] = "ArduRover"
+    MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
+    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
+    REPORTS_HOME: ClassVar[bool] = True
+    BASE_FLAGS: ClassVar[int] = MavModeFlag.CUSTOM_MODE_ENABLED
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
+    CAPABILITIES: ClassVar[int] = 0xF1EF
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = ROVER_MODES
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = RoverArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = RoverFailsafes
+    FENCE: ClassVar[type[ArduPilotFence[Any]]] = RoverFence
+    MOTORS: ClassVar[type[ArduPilotMotors]] = RoverMotors
+    JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""

@@ -184,21 +184,23 @@ class RoverSubAuto(MissionMode):
         self._stops = True  # True if the vehicle stops at `_place`
         self._reached_at: float | None = None  # time of arrival at `_place`; None before
         self._wait_until = 0.0  # end of a delay command
-        self.commands |= {
-            **dict.fromkeys(_WAYPOINTS, SupportedCommand(self._go, self._has_stayed)),
-            Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(
-                self._go, lambda *_: self._place is None or self.has_arrived(self._place)
-            ),
-            **dict.fromkeys(
-                (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY),
-                SupportedCommand(self._wait, lambda *_: vehicle.now >= self._wait_until),
-            ),
-            Cmd.CONDITION_DISTANCE: SupportedCommand(
-                is_done=lambda _, item: self.distance_to_destination < item.param1
-            ),
-            Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
-            **dict.fromkeys(_WITHOUT_EFFECT, SupportedCommand()),
-        }
+        self.commands.update(
+            {
+                **dict.fromkeys(_WAYPOINTS, SupportedCommand(self._go, self._has_stayed)),
+                Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(
+                    self._go, lambda *_: self._place is None or self.has_arrived(self._place)
+                ),
+                **dict.fromkeys(
+                    (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY),
+                    SupportedCommand(self._wait, lambda *_: vehicle.now >= self._wait_until),
+                ),
+                Cmd.CONDITION_DISTANCE: SupportedCommand(
+                    is_done=lambda _, item: self.distance_to_destination < item.param1
+                ),
+                Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+                **dict.fromkeys(_WITHOUT_EFFECT, SupportedCommand()),
+            }
+        )
 
     def travel(self, place: Ned, *, stops: bool) -> None:
         raise NotImplementedError

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.frame import Frame
@@ -36,7 +37,7 @@ class ArduPilotLogServer(LogServer):
     A request during a transfer, or for an unknown log, gets no data.
     """
 
-    FOLDER = "/APM/LOGS"
+    FOLDER: ClassVar[str] = "/APM/LOGS"
     _vehicle: ArduPilotHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, vehicle: ArduPilotHost, logs: Sequence[SimulatedLog], files: FileTree) -> None:
@@ -139,7 +140,7 @@ class ArduPilotSigning(VehicleSigning):
     bit takes effect at the next boot or SETUP_SIGNING.
     """
 
-    AHEAD = ONE_MINUTE
+    AHEAD: ClassVar[int] = ONE_MINUTE
     _vehicle: ArduPilotHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, vehicle: ArduPilotHost, key: SigningKey | None, timestamp: int) -> None:

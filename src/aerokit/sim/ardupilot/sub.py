@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import cycle
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, SpeedType, SubMode
 from aerokit.sim.ardupilot.commands import commanded_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors
-from aerokit.sim.ardupilot.radio import SubJoystick
+from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.ardupilot.radio import ArduPilotJoystick, SubJoystick
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
 from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided, SubHost
-from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import CommandHandler, ReceivedCommand
 from aerokit.sim.motion import SimulatedWind
 from aerokit.sim.vehicle_motion import UnderwaterMotion
@@ -26,8 +29,8 @@ _DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
 class SubArming(ArduPilotArming[SubHost]):
     """ArduSub's arming checks. By default, they do not require a position."""
 
-    ARMED_TEXT = "Arming motors"
-    DISARMED_TEXT = "Disarming motors"
+    ARMED_TEXT: ClassVar[str] = "Arming motors"
+    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
     def reasons(self) -> list[str]:
         if self.vehicle.is_initialised and not self._has_disarm_button():
@@ -57,7 +60,7 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
     """ArduSub's failsafes, except those of terrain, estimator and crash. Most of them act only while armed."""
 
-    BATTERY_PRIORITIES = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
@@ -219,18 +222,18 @@ class SimulatedSub(SubHost):
 
     guided: SubGuided  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    KIND = "sub"
-    FIRMWARE = "ArduSub"
-    MAV_TYPE = MavType.SUBMARINE
-    BASE_FLAGS = int(_BASE)
-    GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
-    CAPABILITIES = 0xF9E7
-    BUILDERS = BUILDERS_OF_KIND["sub"]
-    MODES = SUB_MODES
-    ARMING = SubArming
-    FAILSAFES = SubFailsafes
-    MOTORS = SubMotors
-    JOYSTICK = SubJoystick
+    KIND: ClassVar[Kind] = "sub"
+    FIRMWARE: ClassVar[str] = "ArduSub"
+    MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
+    BASE_FLAGS: ClassVar[int] = int(_BASE)
+    GUIDED_MODES: ClassVar[frozenset[str]] = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
+    CAPABILITIES: ClassVar[int] = 0xF9E7
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = SUB_MODES
+    ARMING: ClassVar[type[ArduPilotArming[Any]]] = SubArming
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = SubFailsafes
+    MOTORS: ClassVar[type[ArduPilotMotors]] = SubMotors
+    JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
         """Create the motion model. Each unit of SIM_BUOYANCY accelerates upwards by 0.1 m/s². Wind has no effect."""
