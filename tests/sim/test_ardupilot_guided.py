@@ -10,7 +10,7 @@ from simulated_client import Client, set_mode
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import AttitudeTargetTypemask as Attitude
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, PlaneMode, RoverMode, SubMode
+from aerokit.mavlink.enums import HeadingType, MavCmd, MavFrame, MavResult, PlaneMode, RoverMode, SubMode
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.sim.kinds import simulated
 from aerokit.sim.motion import quaternion_from_euler
@@ -216,7 +216,7 @@ def test_plane_position_target_changes_altitude_only() -> None:
 
 def test_plane_attitude_target_expires_after_three_seconds() -> None:
     vehicle, client = plane()
-    vehicle.guided.change_course(0.0)
+    assert client.command(MavCmd.GUIDED_CHANGE_HEADING, HeadingType.COURSE_OVER_GROUND, 0.0) == 0
     keep(client, attitude(RATES, (25.0, 5.0, 0.0), thrust=0.6), 3.0)
     assert math.degrees(vehicle.motion.roll) == pytest.approx(25.0, abs=3.0)
     assert vehicle.motion.velocity_down < -0.5

@@ -81,7 +81,7 @@ def test_path_without_position_is_deactivated() -> None:
 
 def test_path_without_space_is_deactivated() -> None:
     rover, client = ready_rover(SRTL_POINTS=14.0)
-    path = SmartPath(rover, only_armed=False)
+    path = SmartPath(rover)
     path.reset()
     for index in range(60):
         rover.motion.north, rover.motion.east = 5.0 * index, 5.0 * (index % 2)

@@ -18,7 +18,7 @@ from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import NO_CLEAR, pack_items, read_header, unpack_items
 from aerokit.protocols.servers.files import EINVAL, ENFILE, ENOENT, FileFault, FileHandle, Mount, UploadedFile
-from aerokit.sim.motion import LocalFrame
+from aerokit.sim.motion import LocalFrame, Ned
 
 INVALID_INDEX = 0xFFFF
 """The value of an unset index."""
@@ -198,23 +198,38 @@ class PolygonZone:
 
     def outside_m(self, place: Point) -> float:
         """Return the distance from the border in metres, which is negative inside."""
-        distance = min(_distance_to_edge(place, start, end) for start, end in self._sides)
+        distance = min(distance_to_segment((*place, 0.0), (*start, 0.0), (*end, 0.0)) for start, end in self._sides)
         crossings = sum(_crosses(place, start, end) for start, end in self._sides)
         is_inside = crossings % 2 == 1  # A ray from a point inside crosses the border an odd number of times.
         return -distance if is_inside else distance
 
 
-def _distance_to_edge(place: Point, start: Point, end: Point) -> float:
-    place_north, place_east = place
-    start_north, start_east = start
-    end_north, end_east = end
-    north, east = end_north - start_north, end_east - start_east
-    squared_length = north * north + east * east
-    share = 0.0  # Point of the edge that is nearest to the place: 0 is the start, 1 the end.
-    if squared_length > 0.0:
-        projection = ((place_north - start_north) * north + (place_east - start_east) * east) / squared_length
-        share = min(1.0, max(0.0, projection))
-    return math.dist(place, (start_north + share * north, start_east + share * east))
+def vector_between(start: Ned, end: Ned) -> Ned:
+    start_north, start_east, start_down = start
+    north, east, down = end
+    return (north - start_north, east - start_east, down - start_down)
+
+
+def dot_product(first: Ned, second: Ned) -> float:
+    first_north, first_east, first_down = first
+    north, east, down = second
+    return first_north * north + first_east * east + first_down * down
+
+
+def point_along(start: Ned, line: Ned, share: float) -> Ned:
+    start_north, start_east, start_down = start
+    north, east, down = line
+    return (start_north + share * north, start_east + share * east, start_down + share * down)
+
+
+def distance_to_segment(point: Ned, start: Ned, end: Ned) -> float:
+    """Return the distance of a point from the line between two places, in metres."""
+    line = vector_between(start, end)
+    squared_length = dot_product(line, line)
+    share = 0.0  # Place on the line that is nearest to the point: 0 is the start, 1 the end.
+    if squared_length != 0.0:
+        share = max(0.0, min(1.0, dot_product(vector_between(start, point), line) / squared_length))
+    return math.dist(point, point_along(start, line, share))
 
 
 def _crosses(place: Point, start: Point, end: Point) -> bool:

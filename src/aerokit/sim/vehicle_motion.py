@@ -246,6 +246,10 @@ class GroundMotion(Motion):
         self._wanted_heading: float | None = None
         """Heading to turn to, which replaces the turn rate; None if the turn rate applies."""
 
+    @property
+    def is_still(self) -> bool:
+        return abs(self.speed_m_s) < 0.01
+
     def stop(self) -> None:
         self.drive(0.0, 0.0)
 
@@ -357,6 +361,9 @@ class UnderwaterMotion(Motion):
     def seek_velocity(self, north: float, east: float, down: float) -> None:
         super().seek_velocity(north, east, down)
         self._is_floating = False
+
+    def stop(self) -> None:
+        self.seek_velocity(0.0, 0.0, 0.0)
 
     def push(self, north: float, east: float) -> None:
         """Move at this horizontal velocity, and let the buoyancy change the depth."""

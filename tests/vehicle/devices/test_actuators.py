@@ -70,9 +70,9 @@ async def test_set_servo_message_refused_returns_at_ack() -> None:
 async def test_set_relay_switches_both_ways() -> None:
     async with on_ground() as flight:
         await flight.vehicle.actuators.set_relay(0, True)
-        assert flight.copter.accessories.relays == 1
+        assert flight.copter.devices.relays == 1
         await flight.vehicle.actuators.set_relay(0, False)
-        assert flight.copter.accessories.relays == 0
+        assert flight.copter.devices.relays == 0
 
 
 @pytest.mark.parametrize("ack_is_lost", [False, True])

@@ -121,16 +121,7 @@ class CompassCalibration:
         seconds = self._vehicle.now - self._started_at - _SETTLING_TIME_S
         return max(0, min(100, int(100.0 * seconds / self.turning_time_s)))
 
-    @property
-    def commands(self) -> dict[int, CommandHandler]:
-        return {
-            MavCmd.DO_START_MAG_CAL: self._start,
-            MavCmd.DO_ACCEPT_MAG_CAL: self._accept,
-            MavCmd.DO_CANCEL_MAG_CAL: self._cancel,
-            MavCmd.FIXED_MAG_CAL_YAW: lambda _: MavResult.ACCEPTED,
-        }
-
-    def _start(self, command: ReceivedCommand) -> int:
+    def start(self, command: ReceivedCommand) -> int:
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
@@ -142,13 +133,13 @@ class CompassCalibration:
         self._saves_at_once = command.param3 != 0.0
         return MavResult.ACCEPTED
 
-    def _accept(self, command: ReceivedCommand) -> int:
+    def accept(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255 or not self._compass_mask or self.is_running:
             return MavResult.FAILED
         self.reset()
         return MavResult.ACCEPTED
 
-    def _cancel(self, command: ReceivedCommand) -> int:
+    def cancel(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
         cancelled = to_int(command.param1)
@@ -216,7 +207,9 @@ class Calibrations:
         return {
             MavCmd.PREFLIGHT_CALIBRATION: self._calibrate,
             MavCmd.ACCELCAL_VEHICLE_POS: self.accelerometers.confirm,
-            **self.compasses.commands,
+            MavCmd.DO_START_MAG_CAL: self.compasses.start,
+            MavCmd.DO_ACCEPT_MAG_CAL: self.compasses.accept,
+            MavCmd.DO_CANCEL_MAG_CAL: self.compasses.cancel,
         }
 
     def _calibrate(self, command: ReceivedCommand) -> int | CommandProgress:

@@ -24,14 +24,11 @@ class ArduPilotCamera:
     heartbeats of the camera. CAM1_TYPE 0 disables the camera.
     """
 
-    image_count: int
-    remaining: int
-
     def __init__(self, vehicle: ArduPilotHost, gimbal: ArduPilotGimbal) -> None:
         self._vehicle, self._gimbal = vehicle, gimbal
-        self.image_count = 0  # Number of images since power-on.
+        self.image_count: int = 0  # Number of images since power-on.
         self.interval_s: float = 0.0  # Seconds between two images of a series.
-        self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
+        self.remaining: int = 0  # Number of images that the series still has to take; -1 is unlimited.
         self.trigger_distance_m: float = 0.0  # Metres between two images triggered by distance; 0 is off.
         self._taken_at = -math.inf  # time of the last image
         self._taken_place: Ned | None = None  # place of the last image
@@ -165,12 +162,7 @@ class ArduPilotCamera:
             foc_len=0.0, flags=CameraFeedbackFlags.PHOTO, completed_captures=0,
         )  # fmt: skip
 
-    def last_feedback(self) -> m.CameraFeedback | None:
-        return self.feedback if self.is_fitted else None
-
-    def information(self) -> m.CameraInformation | None:
-        if not self.is_fitted:
-            return None
+    def information(self) -> m.CameraInformation:
         return m.CameraInformation(
             time_boot_ms=self._vehicle.time_boot_ms, vendor_name=bytes(32), model_name=bytes(32), firmware_version=0,
             focal_length=0.0, sensor_size_h=0.0, sensor_size_v=0.0, resolution_h=0, resolution_v=0, lens_id=0, flags=0,
@@ -178,14 +170,10 @@ class ArduPilotCamera:
             gimbal_device_id=int(self._gimbal.is_fitted),
         )  # fmt: skip
 
-    def settings(self) -> m.CameraSettings | None:
-        if not self.is_fitted:
-            return None
+    def settings(self) -> m.CameraSettings:
         return m.CameraSettings(self._vehicle.time_boot_ms, mode_id=0, zoomLevel=math.nan, focusLevel=math.nan)
 
-    def capture_status(self) -> m.CameraCaptureStatus | None:
-        if not self.is_fitted:
-            return None
+    def capture_status(self) -> m.CameraCaptureStatus:
         # `remaining` is -1 during an unlimited series, which the firmware reports as idle (AP_Camera_Backend.cpp).
         is_series_reported = self.remaining > 0
         return m.CameraCaptureStatus(

@@ -9,10 +9,8 @@ import math
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd as Cmd
-from aerokit.mavlink.enums import MavDoRepositionFlags, MavFrame, MavMountMode, MavSeverity
+from aerokit.mavlink.enums import MavDoRepositionFlags, MavFrame, MavSeverity
 from aerokit.mavlink.enums import MavResult as Result
-from aerokit.protocols.servers.gimbal import Angles, angles_and_rates
-from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
 from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES
 from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -53,12 +51,12 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     return {
         **handlers,
         Cmd.DO_GRIPPER: lambda command: vehicle.devices.grip(command),
-        Cmd.DO_SET_SERVO: lambda command: vehicle.accessories.set_servo(command),
+        Cmd.DO_SET_SERVO: lambda command: vehicle.devices.set_servo(command),
         # Only the first pulse is simulated, which sets the servo as DO_SET_SERVO does.
-        Cmd.DO_REPEAT_SERVO: lambda command: vehicle.accessories.set_servo(command),
-        Cmd.DO_SET_RELAY: lambda command: vehicle.accessories.set_relay(command),
-        Cmd.DO_REPEAT_RELAY: lambda command: vehicle.accessories.repeat_relay(command),
-        Cmd.DO_AUX_FUNCTION: lambda command: vehicle.accessories.switch(command),
+        Cmd.DO_REPEAT_SERVO: lambda command: vehicle.devices.set_servo(command),
+        Cmd.DO_SET_RELAY: lambda command: vehicle.devices.set_relay(command),
+        Cmd.DO_REPEAT_RELAY: lambda command: vehicle.devices.set_relay(command),
+        Cmd.DO_AUX_FUNCTION: lambda command: vehicle.devices.switch(command),
         Cmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
         Cmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
         Cmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
@@ -66,10 +64,6 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         Cmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
         Cmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
         Cmd.SET_CAMERA_FOCUS: lambda command: vehicle.camera.focus(command),
-        Cmd.DO_DIGICAM_CONFIGURE: lambda _: Result.ACCEPTED,
-        Cmd.SET_CAMERA_SOURCE: lambda _: Result.DENIED,
-        Cmd.VIDEO_START_CAPTURE: lambda _: Result.FAILED,
-        Cmd.VIDEO_STOP_CAPTURE: lambda _: Result.FAILED,
         Cmd.EXTERNAL_WIND_ESTIMATE: lambda command: vehicle.external.set_wind(command),
         Cmd.SET_EKF_SOURCE_SET: lambda command: Result.ACCEPTED if command.param1 in _SOURCE_SETS else Result.DENIED,
         Cmd.BATTERY_RESET: common.reset_battery,
@@ -90,8 +84,12 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         **dict.fromkeys((Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE), common.look_at),
         Cmd.DO_SET_ROI_SYSID: common.look_at_vehicle,
         **vehicle.calibrations.commands,
-        **GimbalCommands(vehicle).commands,
-        **HomeAndOrigin(vehicle).commands,
+        Cmd.DO_MOUNT_CONFIGURE: lambda command: vehicle.gimbal.configure_mount(command),
+        Cmd.DO_MOUNT_CONTROL: lambda command: vehicle.gimbal.control_mount(command),
+        Cmd.DO_GIMBAL_MANAGER_PITCHYAW: lambda command: vehicle.gimbal.point_or_turn(command),
+        Cmd.DO_GIMBAL_MANAGER_CONFIGURE: lambda command: vehicle.gimbal.configure_manager(command),
+        Cmd.DO_SET_HOME: common.set_home,
+        Cmd.GET_HOME_POSITION: common.get_home,
     }
 
 
@@ -108,10 +106,15 @@ def commanded_heading(command: ReceivedCommand, yaw: float) -> float | None:
 
 
 class _CommonCommands:
-    """Handlers of the commands that all ArduPilot vehicles execute in the same way."""
+    """Handlers of the commands that all ArduPilot vehicles execute in the same way.
+
+    SET_GPS_GLOBAL_ORIGIN is accepted only once, and only before GPS has set the origin. Until the origin is set, Copter
+    and Sub refuse DO_SET_HOME, whereas Plane and Rover accept it.
+    """
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
+        vehicle.on(m.SetGpsGlobalOrigin, self._on_origin)
 
     def constant_answer(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
         def handle(_: ReceivedCommand) -> int:
@@ -233,23 +236,7 @@ class _CommonCommands:
         self._vehicle.gimbal.follow(to_int(command.param1))
         return Result.ACCEPTED
 
-
-class HomeAndOrigin:
-    """Handlers of DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
-
-    SET_GPS_GLOBAL_ORIGIN is accepted only once, and only before GPS has set the origin. Until the origin is set, Copter
-    and Sub refuse DO_SET_HOME, whereas Plane and Rover accept it.
-    """
-
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
-        self._vehicle = vehicle
-        self.commands: dict[int, CommandHandler] = {
-            Cmd.DO_SET_HOME: self._set_home,
-            Cmd.GET_HOME_POSITION: self._get_home,
-        }
-        vehicle.on(m.SetGpsGlobalOrigin, self._on_origin)
-
-    def _set_home(self, command: ReceivedCommand) -> int:
+    def set_home(self, command: ReceivedCommand) -> int:
         vehicle, nav = self._vehicle, self._vehicle.navigation
         uses_current_place = command.param1 == 1.0 or command.place() == (0, 0)
         if uses_current_place:
@@ -275,7 +262,7 @@ class HomeAndOrigin:
             vehicle.info(f"Set HOME to {latitude:.6f} {longitude:.6f} at {place.altitude_m:.2f}m")
         return Result.ACCEPTED
 
-    def _get_home(self, command: ReceivedCommand) -> int:
+    def get_home(self, command: ReceivedCommand) -> int:
         if self._vehicle.navigation.home is None:
             return Result.FAILED
         self._vehicle.send_home(command.channel)
@@ -288,90 +275,3 @@ class HomeAndOrigin:
         if point is None or place == (0, 0) or not vehicle.navigation.set_origin(point):
             return
         vehicle.send_built(m.GpsGlobalOrigin.ID, channel)
-
-
-_PLAIN_MOUNT_MODES = frozenset(
-    {MavMountMode.RETRACT, MavMountMode.NEUTRAL, MavMountMode.RC_TARGETING, MavMountMode.HOME_LOCATION}
-)
-
-
-class GimbalCommands:
-    """Handlers of DO_MOUNT_CONFIGURE, DO_MOUNT_CONTROL, and the gimbal manager's commands and messages."""
-
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
-        self._vehicle = vehicle
-        self.commands: dict[int, CommandHandler] = {
-            Cmd.DO_MOUNT_CONFIGURE: self._configure_mount,
-            Cmd.DO_MOUNT_CONTROL: self._control_mount,
-            Cmd.DO_GIMBAL_MANAGER_PITCHYAW: self._point_or_turn,
-            Cmd.DO_GIMBAL_MANAGER_CONFIGURE: self._configure_manager,
-        }
-        vehicle.on(m.GimbalManagerSetAttitude, self._on_attitude)
-        vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
-
-    def _gimbal(self, device_id: float = 0) -> ArduPilotGimbal | None:
-        """Return the fitted gimbal if ``device_id`` selects it. 0 selects all gimbals."""
-        gimbal = self._vehicle.gimbal
-        return gimbal if gimbal.is_fitted and to_int(device_id) in (0, 1) else None
-
-    def _configure_mount(self, command: ReceivedCommand) -> int:
-        gimbal = self._gimbal()
-        if gimbal is None:
-            return Result.FAILED
-        gimbal.set_mode(to_int(command.param1))
-        return Result.ACCEPTED
-
-    def _control_mount(self, command: ReceivedCommand) -> int:
-        gimbal = self._gimbal()
-        mode = to_int(command.z)
-        if gimbal is None:
-            return Result.FAILED
-        if mode in _PLAIN_MOUNT_MODES:
-            gimbal.set_mode(mode)
-            return Result.ACCEPTED
-        if mode == MavMountMode.MAVLINK_TARGETING:
-            pitch, roll, yaw = command.param1, command.param2, command.param3
-            if abs(pitch) > 90.0 or abs(roll) > 180.0 or abs(yaw) > 360.0:
-                self._vehicle.send_text(_WARNING, "Mount: invalid angle targets")
-                return Result.FAILED
-            gimbal.point(roll, pitch, yaw, from_north=False)
-            return Result.ACCEPTED
-        # Before AP 4.2, params 1 and 2 contained the position. Newer firmware refuses such a command
-        # (AP_Mount_Backend.cpp).
-        has_place_in_params = command.param1 and command.param2 and not command.x and not command.y
-        if mode == MavMountMode.GPS_POINT and not has_place_in_params:
-            altitude = float(to_int(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
-            frame = MavFrame.GLOBAL_RELATIVE_ALT
-            # The firmware does not check the place. In the simulation, an invalid place makes the gimbal stop looking
-            # at its present target.
-            gimbal.look_at(self._vehicle.world_point(to_int(command.x), to_int(command.y), altitude, frame))
-            return Result.ACCEPTED
-        return Result.FAILED
-
-    def _point_or_turn(self, command: ReceivedCommand) -> int:
-        gimbal = self._gimbal(command.z)
-        if gimbal is None:
-            return Result.FAILED
-        angles = (0.0, command.param1, command.param2)
-        return gimbal.manage(to_int(command.x), angles, (0.0, command.param3, command.param4))
-
-    def _configure_manager(self, command: ReceivedCommand) -> int:
-        gimbal = self._gimbal(command.z)
-        ids = (to_int(command.param1), to_int(command.param2))
-        is_done = gimbal is not None and gimbal.set_control(command.sender, *ids)
-        return Result.ACCEPTED if is_done else Result.FAILED
-
-    def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        self._manage(message, *angles_and_rates(message))
-
-    def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        self._manage(message, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
-
-    def _manage(
-        self, message: m.GimbalManagerSetAttitude | m.GimbalManagerSetPitchyaw, angles: Angles, rates: Angles
-    ) -> None:
-        gimbal = self._gimbal(message.gimbal_device_id)
-        has_both = not any(map(math.isnan, (*angles, *rates)))
-        if gimbal is not None and not has_both:  # The firmware ignores a message with angles and rates.
-            roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate = map(math.degrees, (*angles, *rates))
-            gimbal.manage(message.flags, (roll, pitch, yaw), (roll_rate, pitch_rate, yaw_rate))

@@ -22,7 +22,7 @@ from aerokit.sim.ardupilot import copter_modes as modes
 from aerokit.sim.ardupilot.commands import commanded_heading, common_commands
 from aerokit.sim.ardupilot.copter_auto import CopterAuto
 from aerokit.sim.ardupilot.copter_failsafes import CopterArming, CopterFailsafes, CopterFence
-from aerokit.sim.ardupilot.copter_guided import CopterGuided, CopterSetpoints
+from aerokit.sim.ardupilot.copter_guided import CopterGuided
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import ArduPilotFence
@@ -171,6 +171,8 @@ class SimulatedCopter(CopterHost):
     Not simulated: braking before a fence, the terrain failsafe.
     """
 
+    guided: CopterGuided  # pyright: ignore[reportIncompatibleVariableOverride]
+
     KIND: ClassVar[Kind] = "copter"
     FIRMWARE: ClassVar[str] = "ArduCopter"
     FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
@@ -183,7 +185,6 @@ class SimulatedCopter(CopterHost):
     ARMING: ClassVar[type[ArduPilotArming[Any]]] = CopterArming
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = CopterFailsafes
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = CopterFence
-    SETPOINTS: ClassVar[type[Any]] = CopterSetpoints
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """Return the handlers of the commands that ArduCopter knows."""
@@ -206,9 +207,8 @@ class SimulatedCopter(CopterHost):
         self._on_ground_timer = ConditionTimer()
         self.motor_test: MotorTest = MotorTest(self)
 
-    @property
-    def guided(self) -> CopterGuided:
-        return self.mode_of(CopterGuided)
+    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
+        return f"Mode change to {mode.name} failed: {reason}"
 
     @property
     def is_armed(self) -> bool:

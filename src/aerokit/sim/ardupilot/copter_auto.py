@@ -8,9 +8,7 @@ NAV_SCRIPT_TIME, NAV_ATTITUDE_TIME, DO_GUIDED_LIMITS.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import islice
-from typing import Protocol
 
 from aerokit.mavlink.enums import CopterMode, MavFrame, MavSeverity, SpeedType
 from aerokit.mavlink.enums import MavCmd as Cmd
@@ -18,7 +16,7 @@ from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
 from aerokit.sim.ardupilot.host import RC_THROTTLE
-from aerokit.sim.ardupilot.mission_run import TAKE_OFFS, MissionCommand, MissionMode, place_of, set_home_from
+from aerokit.sim.ardupilot.mission_run import TAKE_OFFS, MissionCommand, MissionMode, SupportedCommand, never, place_of
 from aerokit.sim.motion import Ned, wrap_pi
 
 _STOPPED_M, _ON_CIRCLE_M = 0.3, 3.0
@@ -28,12 +26,7 @@ _RAISED_THROTTLE_PWM = 1100
 _TURN_SHARE_OF_ACCELERATION = 0.7
 
 
-class _Leg(Protocol):
-    """The manoeuvre of a navigation command. `update` sets the motion targets for the next ``dt`` seconds."""
-
-    def update(self, dt: float) -> None: ...
-    @property
-    def is_complete(self) -> bool: ...
+# A leg is the manoeuvre of a navigation command. Its `update` sets the motion targets for the next `dt` seconds.
 
 
 class _FlyLeg:
@@ -164,10 +157,9 @@ _NO_STOP_IF_FOLLOWED_BY = frozenset(
 )
 _WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_LOITER_TIME})
 _LANDINGS = frozenset({Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND})
-_UNTIL_LEG_ENDS = TAKE_OFFS | {Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT, Cmd.NAV_RETURN_TO_LAUNCH}
+_ROI_COMMANDS = (Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE)
 _WITHOUT_EFFECT = (
-    Cmd.DO_FENCE_ENABLE, Cmd.DO_WINCH, Cmd.DO_RETURN_PATH_START, Cmd.DO_LAND_START, Cmd.DO_MOUNT_CONTROL,
-    Cmd.DO_GUIDED_LIMITS, Cmd.NAV_GUIDED_ENABLE, Cmd.CONDITION_DISTANCE,
+    Cmd.DO_WINCH, Cmd.DO_RETURN_PATH_START, Cmd.DO_LAND_START, Cmd.DO_MOUNT_CONTROL, Cmd.DO_GUIDED_LIMITS,
 )  # fmt: skip
 
 
@@ -183,28 +175,37 @@ class CopterAuto(MissionMode):
         super().__init__(copter)
         self.climb: float = 0.0  # Maximum climb rate in m/s.
         self.descent: float = 0.0  # Maximum sink rate in m/s.
-        self._leg: _Leg | None = None  # None while the copter holds its position.
+        # Manoeuvre of the present navigation command; None while the copter holds its position.
+        self._leg: _FlyLeg | _CircleLeg | _ClimbLeg | _ReturnLeg | _DescendLeg | None = None
         self._last_reached = 0  # index of the command to report in MISSION_ITEM_REACHED; 0 if there is none
         self._reached_at: float | None = None  # None until the copter reaches the waypoint.
-        self._condition_started_at = 0.0
         self._delay_until = 0.0
         self._list_version = -1  # version of the command list from which `_upcoming` was read
         # The current and the next navigation commands. They are compared to notice an upload that changes them.
         self._upcoming: tuple[MissionCommand, ...] = ()
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            **dict.fromkeys(TAKE_OFFS, self._take_off),
-            **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TO_ALT), self._fly),
-            **dict.fromkeys(_LANDINGS, self._land),
-            Cmd.NAV_LOITER_TURNS: self._circle,
-            Cmd.NAV_RETURN_TO_LAUNCH: self._return,
-            Cmd.NAV_DELAY: self._delay,
-            Cmd.CONDITION_DELAY: self._wait,
-            Cmd.CONDITION_YAW: self._turn,
-            Cmd.DO_CHANGE_SPEED: self._change_speed,
-            Cmd.DO_SET_HOME: lambda item: set_home_from(copter, item),
-            **dict.fromkeys((Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE), self._look_at),
-            **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
-        }
+        self.commands.update(
+            {
+                **dict.fromkeys(TAKE_OFFS, SupportedCommand(self._take_off, self._has_leg_ended)),
+                **dict.fromkeys(_WAYPOINTS, SupportedCommand(self._fly, self._has_stayed)),
+                Cmd.NAV_LOITER_UNLIM: SupportedCommand(self._fly, never),
+                Cmd.NAV_LOITER_TO_ALT: SupportedCommand(self._fly, self._has_leg_ended),
+                **dict.fromkeys(_LANDINGS, SupportedCommand(self._land, self._land_or_continue)),
+                Cmd.NAV_LOITER_TURNS: SupportedCommand(self._circle, self._has_leg_ended),
+                Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(self._return, self._has_leg_ended),
+                Cmd.NAV_DELAY: SupportedCommand(self._delay, lambda *_: copter.now > self._delay_until),
+                # Param 1 is 1 at the start of the control by a companion computer, and 0 at its end.
+                Cmd.NAV_GUIDED_ENABLE: SupportedCommand(is_done=lambda _, item: item.param1 == 0),
+                Cmd.CONDITION_DISTANCE: SupportedCommand(
+                    is_done=lambda _, item: self.distance_to_destination < max(0.0, item.param1)
+                ),
+                Cmd.CONDITION_YAW: SupportedCommand(
+                    self._turn, lambda *_: copter.yaw.turn_to_last_heading(_HEADING_REACHED_RAD)
+                ),
+                Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+                **dict.fromkeys(_ROI_COMMANDS, SupportedCommand(self._look_at)),
+                **dict.fromkeys(_WITHOUT_EFFECT, SupportedCommand()),
+            }
+        )
 
     @property
     def can_arm(self) -> bool:  # type: ignore[override]
@@ -219,8 +220,7 @@ class CopterAuto(MissionMode):
         leg = self._leg
         return isinstance(leg, _DescendLeg) or (isinstance(leg, _ReturnLeg) and leg.is_landing)
 
-    @property
-    def _is_leg_complete(self) -> bool:
+    def _has_leg_ended(self, _index: int, _item: MissionItem) -> bool:
         return self._leg is not None and self._leg.is_complete
 
     @property
@@ -313,41 +313,18 @@ class CopterAuto(MissionMode):
             self._leg = None
             self.vehicle.yaw.hold()
 
-    def _is_done(self, index: int, item: MissionItem) -> bool:
-        command, now = item.command, self.vehicle.now
-        if command in _WAYPOINTS:
-            return self._has_stayed(index, item.param1)
-        if command in _UNTIL_LEG_ENDS:
-            return self._is_leg_complete
-        if command in _LANDINGS:
-            return self._land_or_continue(index)
-        if command == Cmd.NAV_LOITER_UNLIM:
-            return False
-        if command == Cmd.NAV_GUIDED_ENABLE:
-            return item.param1 == 0  # 0 ends the control by a companion computer, 1 starts it.
-        if command == Cmd.NAV_DELAY:
-            return now > self._delay_until
-        if command == Cmd.CONDITION_DELAY:
-            return now - self._condition_started_at > max(0.0, item.param1)
-        if command == Cmd.CONDITION_DISTANCE:
-            return self.distance_to_destination < max(0.0, item.param1)
-        if command == Cmd.CONDITION_YAW:
-            return self.vehicle.yaw.turn_to_last_heading(_HEADING_REACHED_RAD)
-        self.warn_if_unknown(item)
-        return True
-
-    def _has_stayed(self, index: int, seconds: float) -> bool:
-        if not self._is_leg_complete:
+    def _has_stayed(self, index: int, item: MissionItem) -> bool:
+        if not self._has_leg_ended(index, item):
             return False
         if self._reached_at is None:
             self._reached_at = self.vehicle.now
         # The firmware counts whole seconds (mode_auto.cpp, verify_nav_wp).
-        if math.floor(self.vehicle.now - self._reached_at) < seconds:
+        if math.floor(self.vehicle.now - self._reached_at) < item.param1:
             return False
         self.vehicle.info(f"Reached command #{index}")
         return True
 
-    def _land_or_continue(self, index: int) -> bool:
+    def _land_or_continue(self, index: int, item: MissionItem) -> bool:
         """Return True if the mission continues with a take-off. Otherwise, land and disarm."""
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
@@ -355,14 +332,14 @@ class CopterAuto(MissionMode):
                 copter.yaw.hold()
                 self._leg = _DescendLeg(copter)
             return False
-        if not self._is_leg_complete:
+        if not self._has_leg_ended(index, item):
             return False
         if int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND and copter.mission.is_take_off(index + 1):
             return True
         copter.arming.disarm()
         return False
 
-    def _place(self, item: MissionItem) -> Ned:
+    def _place_of(self, item: MissionItem) -> Ned:
         current: Ned = self.vehicle.motion.place
         if isinstance(self._leg, _FlyLeg) and self._leg.is_complete:
             current = self._leg.destination  # more exact than the copter's position, which differs a little
@@ -381,7 +358,7 @@ class CopterAuto(MissionMode):
         if not stops:
             following = next(run.navigation_from(run.nav_index + 1), None)
             stops = following is None or following.item.command not in _NO_STOP_IF_FOLLOWED_BY
-        self._go(self._place(item), stops=stops)
+        self._go(self._place_of(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
         copter = self.vehicle
@@ -397,14 +374,14 @@ class CopterAuto(MissionMode):
         self._leg = _ClimbLeg(self, home_down - target_down)
 
     def _circle(self, item: MissionItem) -> None:
-        self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
+        self._leg = _CircleLeg(self, self._place_of(item), turns=item.param1, radius=item.param3)
 
     def _land(self, item: MissionItem) -> None:
         self.vehicle.yaw.hold()
         if (item.x, item.y) == (0, 0):
             self._leg = _DescendLeg(self.vehicle)
             return
-        north, east, _ = self._place(item)
+        north, east, _ = self._place_of(item)
         self._go((north, east, self.vehicle.motion.down))
 
     def _return(self, _: MissionItem) -> None:
@@ -416,9 +393,6 @@ class CopterAuto(MissionMode):
         seconds = max(0.0, item.param1)  # A negative number (to wait for a time of day) is not simulated.
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
-
-    def _wait(self, _: MissionItem) -> None:
-        self._condition_started_at = self.vehicle.now
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)

@@ -169,7 +169,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
 
     def _check_ground_station(self) -> None:
         copter, parameters = self.vehicle, self.vehicle.parameters
-        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
+        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.vehicle.ground_station_seen_at):
             return
         is_lost = self.ground_station_silence > parameters["FS_GCS_TIMEOUT"]
         if is_lost == self.is_ground_station_lost:
@@ -307,20 +307,18 @@ class CopterFence(ArduPilotFence[CopterHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        vehicle = self.vehicle
-        action = int(vehicle.parameters["FENCE_ACTION"])
-        if vehicle.is_landed:
-            if action != REPORT_ONLY:
-                vehicle.arming.disarm()
+        if self.vehicle.is_landed:
+            if self.action != REPORT_ONLY:
+                self.vehicle.arming.disarm()
             return
         self.report("breached", new_breaches)
-        if action == REPORT_ONLY:
+        if self.action == REPORT_ONLY:
             return
         # The firmware treats an unknown action as RTL (fence.cpp).
-        modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[_FENCE_RTL])
+        modes = _FENCE_ACTIONS.get(self.action, _FENCE_ACTIONS[_FENCE_RTL])
         if self.beyond_m(new_breaches) > _LAND_BEYOND_M:
             modes = (CopterMode.LAND,)
-        self.enter_first_accepted(modes)
+        self.caused_mode: bool = self.vehicle.enter_first_accepted(*modes)
 
     def on_cleared(self) -> None:
         if not self.vehicle.is_landed:
@@ -330,8 +328,3 @@ class CopterFence(ArduPilotFence[CopterHost]):
         if not self.forbids_modes() or not self.vehicle.is_armed or self.vehicle.is_landed:
             return None
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
-
-    def on_mode_changed(self) -> None:
-        super().on_mode_changed()
-        if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
-            self.recover_by_hand()

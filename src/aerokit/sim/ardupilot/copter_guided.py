@@ -9,12 +9,21 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import CopterMode, MavFrame
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase, CopterTakeOff
+from aerokit.sim.ardupilot.host import GuidedMode
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import PositionTarget, Setpoint, constrained, is_finite, rotated
 from aerokit.sim.motion import Ned, euler_from_quaternion
 
 _ZERO: Ned = (0.0, 0.0, 0.0)
 _UNIT_LENGTH_TOLERANCE = 1e-3
+
+
+_BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
+_LOCAL = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED}) | _BODY
+_ALL_RATES = (
+    AttitudeMask.BODY_ROLL_RATE_IGNORE | AttitudeMask.BODY_PITCH_RATE_IGNORE | AttitudeMask.BODY_YAW_RATE_IGNORE
+)
+_MAX_VELOCITY_M_S = 1000.0
 
 
 class GuidedSubmode(Enum):
@@ -28,11 +37,11 @@ class GuidedSubmode(Enum):
     ATTITUDE = "attitude"
 
 
-class CopterGuided(CopterModeBase):
+class CopterGuided(CopterModeBase, GuidedMode):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
     DO_CHANGE_SPEED sets a speed limit. When the type of target changes (position, velocity, acceleration), the limits
-    are WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN again, as in ArduCopter.
+    are WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN again, as in ArduCopter. An invalid set-point stops the copter.
     """
 
     number: int = CopterMode.GUIDED
@@ -104,22 +113,20 @@ class CopterGuided(CopterModeBase):
         self._set_targets(submode, position=position, velocity=velocity, acceleration=acceleration)
         return True
 
-    def lean(self, roll: float, pitch: float, climb: float) -> None:
-        """Hold roll and pitch in radians and a climb rate in m/s."""
-        self.submode = GuidedSubmode.ATTITUDE
-        self._attitude = (roll, pitch)
-        self._attitude_climb = climb
-        self._body_rates = None
-        self._updated_at = self.vehicle.now
+    def set_attitude(
+        self, angles: tuple[float, float], climb: float, body_rates: tuple[float, float] | None = None
+    ) -> None:
+        """Hold roll and pitch in radians and a climb rate in m/s.
 
-    def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
-        """Change roll and pitch at these rates in rad/s, and climb at a rate in m/s."""
-        # The first call starts at the present attitude. Later calls continue from the commanded attitude.
-        if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
+        ``body_rates`` in rad/s replace the angles: they change the present or the last commanded roll and pitch.
+        """
+        if body_rates is None:
+            self._attitude = angles
+        elif self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
             self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
         self.submode = GuidedSubmode.ATTITUDE
         self._attitude_climb = climb
-        self._body_rates = (roll_rate, pitch_rate)
+        self._body_rates = body_rates
         self._updated_at = self.vehicle.now
 
     def pause(self) -> bool:
@@ -210,49 +217,23 @@ class CopterGuided(CopterModeBase):
         down = max(-self.climb, min(self.descent, down))
         self.vehicle.motion.follow_trajectory((north, east, down), acceleration)
 
-
-_BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
-_LOCAL = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED}) | _BODY
-_ALL_RATES = (
-    AttitudeMask.BODY_ROLL_RATE_IGNORE | AttitudeMask.BODY_PITCH_RATE_IGNORE | AttitudeMask.BODY_YAW_RATE_IGNORE
-)
-_MAX_VELOCITY_M_S = 1000.0
-
-
-class CopterSetpoints:
-    """Handlers of the set-point messages. As in the firmware, an invalid message in GUIDED stops the vehicle."""
-
-    def __init__(self, copter: CopterHost) -> None:
-        self._copter = copter
-        copter.on(SetPositionTargetLocalNed, self._on_local)
-        copter.on(SetPositionTargetGlobalInt, self._on_global)
-        copter.on(SetAttitudeTarget, self._on_attitude)
-
-    @property
-    def _guided(self) -> CopterGuided:
-        return self._copter.mode_of(CopterGuided)
-
-    @property
-    def _is_guided(self) -> bool:
-        return self._copter.mode is self._guided
-
-    def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
-        if not self._is_guided:
+    def on_local_target(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
+        if not self.is_active:
             return
         frame = target.coordinate_frame
-        point = self._copter.local_point(target, _BODY)
+        point = self.vehicle.local_point(target, _BODY)
         if frame not in _LOCAL or not self._follow(target, point, rotate=frame in _BODY):
-            self._guided.enter(force=False)  # An invalid message stops the vehicle.
+            self.enter(force=False)  # An invalid message stops the vehicle.
 
-    def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
-        if not self._is_guided:
+    def on_global_target(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        if not self.is_active:
             return
-        point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
+        point = self.vehicle.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_position_missing = point is None and Setpoint.of(target).has_position
         # If the message has no position, `_follow` ignores its argument `point`.
         is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
         if not is_followed:
-            self._guided.enter(force=False)  # An invalid message stops the vehicle.
+            self.enter(force=False)  # An invalid message stops the vehicle.
 
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
         """Follow a set-point. Return False if it is invalid.
@@ -260,7 +241,7 @@ class CopterSetpoints:
         ``point`` is the position in the world frame. With ``rotate``, velocity, acceleration and yaw are in the body
         frame.
         """
-        setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
+        setpoint, motion, yaw = Setpoint.of(target), self.vehicle.motion, self.vehicle.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None
         acceleration = setpoint.acceleration if setpoint.has_acceleration else None
         is_velocity_valid = all(abs(part) <= _MAX_VELOCITY_M_S for part in velocity or _ZERO)
@@ -270,7 +251,7 @@ class CopterSetpoints:
             velocity = None if velocity is None else rotated(velocity, motion.yaw)
             acceleration = None if acceleration is None else rotated(acceleration, motion.yaw)
         position = point if setpoint.has_position else None
-        if not self._guided.set_target(position, velocity, acceleration):
+        if not self.set_target(position, velocity, acceleration):
             return False
         if setpoint.yaw is not None:
             yaw.turn_to(setpoint.yaw + (motion.yaw if rotate else 0.0))  # In a body frame, yaw is relative to the nose.
@@ -280,8 +261,8 @@ class CopterSetpoints:
             yaw.apply_default()
         return True
 
-    def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
-        copter, mask = self._copter, target.type_mask
+    def on_attitude_target(self, target: SetAttitudeTarget, _: Channel) -> None:
+        copter, mask = self.vehicle, target.type_mask
         guided = copter.mode
         if not isinstance(guided, CopterGuided):
             return
@@ -306,7 +287,6 @@ class CopterSetpoints:
         climb_share = (constrained(target.thrust, 0.0, 1.0) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0
-        if not has_attitude and not ignored_rates:
-            guided.rotate(target.body_roll_rate, target.body_pitch_rate, climb)
-        else:
-            guided.lean(roll, pitch, climb)
+        has_rates_only = not has_attitude and not ignored_rates
+        body_rates = (target.body_roll_rate, target.body_pitch_rate) if has_rates_only else None
+        guided.set_attitude((roll, pitch), climb, body_rates)

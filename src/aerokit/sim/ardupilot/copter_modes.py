@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from aerokit.sim.ardupilot.host import RC_PITCH, RC_ROLL, RC_THROTTLE, RC_YAW, ArduPilotMode
-from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
+from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.commands import rotated
 from aerokit.sim.motion import Ned, wrap_pi
@@ -120,11 +120,6 @@ class CopterHost(ArduPilotVehicle):
 
     def reset_controllers(self) -> None:
         self.yaw: AutoYaw = AutoYaw(self)
-        self.path: SmartPath = SmartPath(self, only_armed=True)
-
-    def _become_ready(self) -> None:
-        super()._become_ready()
-        self.path.start()
 
     def look_at(self, place: Ned | None) -> None:
         self.yaw.set_region_of_interest(place)
@@ -324,7 +319,7 @@ class CopterRtl(CopterModeBase):
         self._phase = "climb"  # "climb", "return", "wait" or "land"
         self._return_down = 0.0  # altitude of the return
         self._waiting_since = 0.0
-        self._place: Ned = (0.0, 0.0, 0.0)  # place to which the copter returns
+        self._end: Ned = (0.0, 0.0, 0.0)  # place at which the copter lands
         self.speed: float = 0.0
 
     def enter(self, *, force: bool) -> bool:
@@ -335,11 +330,11 @@ class CopterRtl(CopterModeBase):
         self.speed = copter.speed_limit("RTL_SPEED") or copter.speed_limit("WPNAV_SPEED")
         home = copter.home_or_ground
         _, _, home_down = home
-        self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
-        _, _, down = self._place
-        # The copter returns at the return altitude or at the altitude of `_place`, whichever is higher. `min` selects
+        self._end = best_return_place(copter, home, is_allowed=copter.fence.contains)
+        _, _, down = self._end
+        # The copter returns at the return altitude or at the altitude of `_end`, whichever is higher. `min` selects
         # the higher one, because a smaller down coordinate is higher.
-        self._return_down = min(down, home_down - self._return_altitude(copter.motion.distance_to(self._place)))
+        self._return_down = min(down, home_down - self._return_altitude(copter.motion.distance_to(self._end)))
         copter.yaw.apply_default(returning=True)
         return True
 
@@ -356,7 +351,7 @@ class CopterRtl(CopterModeBase):
 
     @property
     def destination(self) -> Ned | None:
-        north, east, down = self._place
+        north, east, down = self._end
         if self._phase == "climb":
             return (self.vehicle.motion.north, self.vehicle.motion.east, self._return_down)
         return (north, east, down if self._phase == "land" else self._return_down)

@@ -1,26 +1,46 @@
-"""Gripper, landing gear, parachute and winch of a simulated ArduPilot, fitted by the parameters of the firmware."""
+"""Servos, relays, gripper, landing gear, parachute and winch of a simulated ArduPilot."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import GripperActions, MavSeverity, ParachuteAction, WinchActions
+from aerokit.mavlink.enums import GripperActions, MavCmd, MavSeverity, ParachuteAction, WinchActions
 from aerokit.mavlink.enums import MavResult as Result
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming
 from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.commands import ReceivedCommand, constrained, to_int
 
 _GRIP_DURATION_S = 0.7
 _WINCH_RATE_M_S, _WINCH_INTERVAL_S = 1.0, 0.1
 _MIN_CHUTE_ALTITUDE_M = 10.0
+_SERVOS = 32
+_RELAYS = {"rover": 2}
+_FUNCTIONS = 320
+_SAVE_WAYPOINT = 7
+# Numbers of the auxiliary functions that each firmware refused in SITL.
+_REFUSED_FUNCTIONS: dict[Kind, tuple[int, ...]] = {
+    "copter": (0,),
+    "plane": (0, _SAVE_WAYPOINT),
+    "rover": (),
+    "sub": (0, _SAVE_WAYPOINT),
+}
+# SERVOn_FUNCTIONs of free outputs: none, and those that pass an RC channel through.
+_FREE_FUNCTIONS = frozenset({0, 1, *range(51, 67)})
+_AUX_POSITIONS = (0.0, 1.0, 2.0)
 
 
 class ArduPilotDevices:
-    """State of gripper, landing gear, parachute and winch, which a reboot resets."""
+    """State of the attached devices, which a reboot resets. Parameters select which ones the vehicle has.
+
+    DO_SET_SERVO and DO_SET_RELAY set servos and relays. DO_AUX_FUNCTION is answered, but has no effect.
+    """
 
     def __init__(self, vehicle: ArduPilotHost, arming: ArduPilotArming[Any]) -> None:
         self._vehicle, self._arming = vehicle, arming
+        self.servos: dict[int, int] = {}  # Pulses in microseconds by output number, which counts from 1.
+        self.relays: int = 0  # Bit mask of the relays that are on.
         self.is_gripped: bool = False
         self.gear_is_up: bool = False
         self.chute_is_released: bool = False
@@ -110,3 +130,34 @@ class ArduPilotDevices:
         unknown, unknown_temperature, healthy = float("nan"), 0x7FFF, 1
         electrical = (unknown, unknown, unknown, unknown_temperature)  # tension, voltage, current, temperature
         return m.WinchStatus(self._vehicle.time_boot_us, self.line_m, self.line_rate_m_s, *electrical, healthy)
+
+    @property
+    def relay_count(self) -> int:
+        return _RELAYS.get(self._vehicle.KIND, 1)
+
+    def set_servo(self, command: ReceivedCommand) -> int:
+        output = to_int(command.param1)
+        if not 1 <= output <= _SERVOS:
+            return Result.FAILED
+        if self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) not in _FREE_FUNCTIONS:
+            self._vehicle.info(f"ServoRelayEvent: Channel {output} is already in use")
+            return Result.FAILED
+        self.servos[output] = to_int(command.param2)
+        return Result.ACCEPTED
+
+    def set_relay(self, command: ReceivedCommand) -> int:
+        if not 0 <= command.param1 < self.relay_count:
+            return Result.FAILED
+        if command.command == MavCmd.DO_SET_RELAY:  # After DO_REPEAT_RELAY, the relay has its previous state again.
+            bit = 1 << to_int(command.param1)
+            self.relays = self.relays | bit if command.param2 else self.relays & ~bit
+        return Result.ACCEPTED
+
+    def switch(self, command: ReceivedCommand) -> int:
+        function = to_int(command.param1)
+        if command.param2 not in _AUX_POSITIONS:
+            return Result.DENIED
+        if not 0 <= function < _FUNCTIONS or function in _REFUSED_FUNCTIONS[self._vehicle.KIND]:
+            self._vehicle.info(f"Invalid channel option ({function})")
+            return Result.FAILED
+        return Result.ACCEPTED

@@ -14,8 +14,6 @@ from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotHost, ConditionTime
 _OK, _LOW, _CRITICAL = 0, 1, 2
 _NAMES_IN_PARAMETERS = {_LOW: "LOW", _CRITICAL: "CRT"}
 _NAMES_IN_TEXTS = {_LOW: "low", _CRITICAL: "critical"}
-# Parameters with the lowest voltage and charge of each level.
-_LIMITS = {_LOW: ("BATT_LOW_VOLT", "BATT_LOW_MAH"), _CRITICAL: ("BATT_CRT_VOLT", "BATT_CRT_MAH")}
 _PERIOD_S = 0.1
 
 
@@ -79,9 +77,9 @@ class BatteryFailsafe:
 
     def _low_quantities(self, level: int) -> tuple[bool, bool]:
         """Return (voltage is low, charge is low)."""
-        volts_name, mah_name = _LIMITS[level]
+        prefix, parameters = f"BATT_{_NAMES_IN_PARAMETERS[level]}", self._vehicle.parameters
         # The value 0 of these parameters means that there is no limit.
-        min_volts, min_mah = self._vehicle.parameters[volts_name], self._vehicle.parameters[mah_name]
+        min_volts, min_mah = parameters[f"{prefix}_VOLT"], parameters[f"{prefix}_MAH"]
         is_voltage_low = min_volts > 0 and self._vehicle.battery.voltage_v < min_volts
         is_charge_low = min_mah > 0 and self._remaining_mah() < min_mah
         return is_voltage_low, is_charge_low
@@ -105,8 +103,6 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.is_ground_station_lost = False
         self.has_estimator_failed = False
         self.is_radio_lost = False  # A lost radio also prevents arming.
-        self.ground_station_seen_at: float = math.nan
-        """Time of the last heartbeat, RC override or MANUAL_CONTROL of the ground station MAV_GCS_SYSID."""
         self.radio_received_at: float = math.nan  # Time of the last RC pulses or overrides.
 
     def start(self) -> None:
@@ -131,7 +127,7 @@ class ArduPilotFailsafes(Generic[HostT]):
     @property
     def ground_station_silence(self) -> float:
         """Seconds since the ground station was last received. NaN before the first time."""
-        return self.vehicle.now - self.ground_station_seen_at
+        return self.vehicle.now - self.vehicle.ground_station_seen_at
 
     def update(self) -> None:
         self.battery.update()
@@ -142,10 +138,6 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     def warn(self, text: str, severity: int = MavSeverity.WARNING) -> None:
         self.vehicle.send_text(severity, text)
-
-    def change_to(self, *modes: int) -> bool:
-        """Change to the first mode that is not refused. Return False if all modes are refused."""
-        return any(self.vehicle.set_mode(mode) for mode in modes)
 
 
 _CHECK_INTERVAL_S = 1.0
@@ -323,6 +315,8 @@ class ArduPilotArming(Generic[HostT]):
 
     def on_armed(self) -> None: ...
 
+    def on_disarmed(self) -> None: ...
+
     def _reasons_not_to_arm(self, *, force: bool) -> list[str]:
         if force and self.vehicle.is_initialised:
             return self.mandatory_reasons()
@@ -335,12 +329,14 @@ class ArduPilotArming(Generic[HostT]):
             return True
         if not self.needs_arming:  # ARMING_REQUIRE 0 keeps the vehicle armed for ever.
             return False
-        if not vehicle.is_landed and not force:
+        may_be_flying = vehicle.KIND in ("copter", "plane") and not vehicle.is_landed
+        if may_be_flying and not force:
             return False
         vehicle.fence.on_disarmed()
         vehicle.info(self.DISARMED_TEXT)
         vehicle.motors.set_armed(armed=False)
         vehicle.mission.on_disarmed()
+        self.on_disarmed()
         return True
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import ClassVar, Generic
 
 from aerokit.mavlink import messages as m
@@ -60,11 +59,15 @@ class ArduPilotFence(Generic[HostT]):
         # How many metres beyond the fence a vehicle must be to cause the next breach, by kind of fence.
         self._new_breach_m: dict[int, float] = {}
         self._floor_enabled_by_command: bool | None = None  # value of the last command; None without a command
-        self._recovering_since = -math.inf  # time of the last `recover_by_hand`
+        self._recovering_since = -math.inf  # time of the last mode change during a breach
         self._reported_at = -math.inf  # time of the last FENCE_STATUS about a breach
         self._checked_at = -math.inf
         self._zones = FenceZones((), vehicle.frame)
         self._zone_items: list[object] = []  # the items from which `_zones` was made
+
+    @property
+    def action(self) -> int:
+        return int(self.vehicle.parameters["FENCE_ACTION"])
 
     @property
     def configured(self) -> int:
@@ -90,7 +93,7 @@ class ArduPilotFence(Generic[HostT]):
     def health(self) -> tuple[bool, bool, bool]:
         """The three bits of the fence in SYS_STATUS: present, enabled and healthy."""
         present = self.present != 0
-        enforced = present and self.enabled != 0 and self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY
+        enforced = present and self.enabled != 0 and self.action != REPORT_ONLY
         return present, enforced, not (present and self.breached)
 
     def set_enabled(self, kinds: int, *, on: bool, by_command: bool = True) -> int:
@@ -235,9 +238,6 @@ class ArduPilotFence(Generic[HostT]):
 
     def act(self, new_breaches: int) -> None: ...
 
-    def enter_first_accepted(self, modes: Sequence[int]) -> None:
-        self.caused_mode = any(self.vehicle.set_mode(mode) for mode in modes)  # stops at the first accepted mode
-
     def on_cleared(self) -> None: ...
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
@@ -245,7 +245,12 @@ class ArduPilotFence(Generic[HostT]):
         return None
 
     def on_mode_changed(self) -> None:
+        """Suspend the reactions to breaches for ten seconds, because the pilot recovers by hand."""
         self.caused_mode = False
+        has_reactions = self.vehicle.KIND != "sub" and (self.vehicle.KIND != "copter" or self.action != REPORT_ONLY)
+        if self.breached and has_reactions:
+            self._recovering_since = self.vehicle.now
+            self.vehicle.info("Manual recovery started")
 
     def beyond_m(self, kinds: int) -> float:
         """Return the largest distance beyond the limits of ``kinds``."""
@@ -256,12 +261,6 @@ class ArduPilotFence(Generic[HostT]):
         """Return True while FENCE_OPTIONS forbids leaving the mode that a breach caused."""
         forbidden = int(self.vehicle.parameters["FENCE_OPTIONS"]) & _NO_MODE_CHANGE
         return bool(forbidden and self.enabled and self.breached and self.caused_mode)
-
-    def recover_by_hand(self) -> None:
-        """Suspend the reactions to breaches for ten seconds."""
-        if self.breached:
-            self._recovering_since = self.vehicle.now
-            self.vehicle.info("Manual recovery started")
 
     def _parameter(self, name: str) -> float:
         """Return a parameter, or its default if the vehicle does not have it."""

@@ -17,10 +17,12 @@ from aerokit.mavlink.enums import (
     MavFrame,
     MavMountMode,
     MavResult,
+    MavSeverity,
 )
-from aerokit.mavlink.messages import GlobalPositionInt
+from aerokit.protocols.servers.gimbal import Angles, angles_and_rates
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.channel import Channel
+from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.motion import Ned, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
@@ -37,8 +39,9 @@ _CAPABILITIES = (
     | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_FOLLOW | _Can.HAS_YAW_LOCK
 )  # fmt: skip
 _FROM_NORTH = frozenset({MavMountMode.GPS_POINT, MavMountMode.SYSID_TARGET, MavMountMode.HOME_LOCATION})
-
-
+_PLAIN_MOUNT_MODES = frozenset(
+    {MavMountMode.RETRACT, MavMountMode.NEUTRAL, MavMountMode.RC_TARGETING, MavMountMode.HOME_LOCATION}
+)
 _FIXED_ANGLE_MODES = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 
@@ -58,22 +61,21 @@ class ArduPilotGimbal:
     """The gimbal: its mode, its target and the component in control. :attr:`angles` is the direction of the gimbal."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
-        self._vehicle = vehicle
-        self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))  # A MAV_MOUNT_MODE.
+        self._vehicle, self._parameters = vehicle, vehicle.parameters
+        self.mode: int = int(self._parameters["MNT1_DEFLT_MODE"])  # A MAV_MOUNT_MODE.
         self.is_yaw_locked: bool = False  # True if the pilot's stick controls yaw relative to north.
         self.in_control: tuple[int, int] = (0, 0)  # System id and component id that control the gimbal.
         self._target = MountTarget()
         self._region: Ned | None = None  # region of interest; None if there is none
         self._followed_id = 0  # system id of the followed vehicle
         self._followed_place: Ned | None = None  # None until its position is received
-        vehicle.observe(GlobalPositionInt, self._on_global_position)
+        vehicle.observe(m.GlobalPositionInt, self._on_global_position)
+        vehicle.on(m.GimbalManagerSetAttitude, self._on_manager_message)
+        vehicle.on(m.GimbalManagerSetPitchyaw, self._on_manager_message)
 
     @property
     def is_fitted(self) -> bool:
-        return self._vehicle.parameters["MNT1_TYPE"] != 0
-
-    def setting(self, name: str) -> float:
-        return self._vehicle.parameters[name]
+        return self._parameters["MNT1_TYPE"] != 0
 
     @property
     def angles(self) -> tuple[float, float, float]:
@@ -95,7 +97,7 @@ class ArduPilotGimbal:
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
             mode_name = MavMountMode(self.mode).name
-            roll, pitch, yaw = (self.setting(f"MNT1_{mode_name}_{axis}") for axis in "XYZ")
+            roll, pitch, yaw = (self._parameters[f"MNT1_{mode_name}_{axis}"] for axis in "XYZ")
             return MountTarget(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
             return self._update_target_for(self._region)
@@ -130,10 +132,10 @@ class ArduPilotGimbal:
         return math.remainder(target.yaw - math.degrees(self._vehicle.motion.yaw), 360.0)
 
     def _limited(self, axis: str, angle: float) -> float:
-        return max(self.setting(f"MNT1_{axis}_MIN"), min(self.setting(f"MNT1_{axis}_MAX"), angle))
+        return max(self._parameters[f"MNT1_{axis}_MIN"], min(self._parameters[f"MNT1_{axis}_MAX"], angle))
 
     def _middle(self, axis: str) -> float:
-        return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
+        return (self._parameters[f"MNT1_{axis}_MIN"] + self._parameters[f"MNT1_{axis}_MAX"]) / 2.0
 
     def set_mode(self, mode: int) -> None:
         """Set a MAV_MOUNT_MODE. Unknown values are ignored."""
@@ -164,7 +166,7 @@ class ArduPilotGimbal:
         if place is not None:
             self.set_mode(MavMountMode.GPS_POINT)
         elif self.mode == MavMountMode.GPS_POINT:
-            self.set_mode(int(self.setting("MNT1_DEFLT_MODE")))
+            self.set_mode(int(self._parameters["MNT1_DEFLT_MODE"]))
 
     def follow(self, system_id: int) -> None:
         """Point at another vehicle once its position is received."""
@@ -172,7 +174,7 @@ class ArduPilotGimbal:
         self._followed_place = None
         self.set_mode(MavMountMode.SYSID_TARGET)
 
-    def _on_global_position(self, message: GlobalPositionInt, _: Channel) -> None:
+    def _on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
         sender_system, _component = sender_of(message)
         if sender_system != self._followed_id:
             return
@@ -180,24 +182,76 @@ class ArduPilotGimbal:
         if place is not None:
             self._followed_place = place
 
-    def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
-        """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Return False for invalid ids."""
+    def _is_selected(self, device_id: float) -> bool:
+        """Return True if there is a gimbal, and ``device_id`` selects it. 0 selects all gimbals."""
+        return self.is_fitted and to_int(device_id) in (0, _DEVICE_ID)
+
+    def configure_mount(self, command: ReceivedCommand) -> int:
+        if not self.is_fitted:
+            return MavResult.FAILED
+        self.set_mode(to_int(command.param1))
+        return MavResult.ACCEPTED
+
+    def control_mount(self, command: ReceivedCommand) -> int:
+        mode = to_int(command.z)
+        if not self.is_fitted:
+            return MavResult.FAILED
+        if mode in _PLAIN_MOUNT_MODES:
+            self.set_mode(mode)
+            return MavResult.ACCEPTED
+        if mode == MavMountMode.MAVLINK_TARGETING:
+            pitch, roll, yaw = command.param1, command.param2, command.param3
+            if abs(pitch) > 90.0 or abs(roll) > 180.0 or abs(yaw) > 360.0:
+                self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
+                return MavResult.FAILED
+            self.point(roll, pitch, yaw, from_north=False)
+            return MavResult.ACCEPTED
+        # Before AP 4.2, params 1 and 2 contained the position. Newer firmware refuses such a command
+        # (AP_Mount_Backend.cpp).
+        has_place_in_params = command.param1 and command.param2 and not command.x and not command.y
+        if mode == MavMountMode.GPS_POINT and not has_place_in_params:
+            altitude = float(to_int(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
+            frame = MavFrame.GLOBAL_RELATIVE_ALT
+            # The firmware does not check the place. In the simulation, an invalid place makes the gimbal stop looking
+            # at its present target.
+            self.look_at(self._vehicle.world_point(to_int(command.x), to_int(command.y), altitude, frame))
+            return MavResult.ACCEPTED
+        return MavResult.FAILED
+
+    def configure_manager(self, command: ReceivedCommand) -> int:
+        system, component = to_int(command.param1), to_int(command.param2)
         are_ids_valid = all(_MIN_ID <= number <= 255 for number in (system, component))
-        if not are_ids_valid:
-            return False
+        if not self._is_selected(command.z) or not are_ids_valid:
+            return MavResult.FAILED
         previous = self.in_control
         if system == _TAKE_CONTROL:
-            self.in_control = sender
+            self.in_control = command.sender
         elif system == _RELEASE_CONTROL:
-            self.in_control = (0, 0) if previous == sender else previous
+            self.in_control = (0, 0) if previous == command.sender else previous
         elif system != _KEEP_CONTROL:
             self.in_control = (system, component)
         if self.in_control != previous:
             # The status follows the acknowledgement.
             self._vehicle.call_later(0.0, lambda: self._vehicle.send_built(m.GimbalManagerStatus.ID))
-        return True
+        return MavResult.ACCEPTED
 
-    def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
+    def point_or_turn(self, command: ReceivedCommand) -> int:
+        if not self._is_selected(command.z):
+            return MavResult.FAILED
+        angles, rates = (0.0, command.param1, command.param2), (0.0, command.param3, command.param4)
+        return self._manage(to_int(command.x), angles, rates)
+
+    def _on_manager_message(self, message: m.GimbalManagerSetAttitude | m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        if isinstance(message, m.GimbalManagerSetAttitude):
+            angles, rates = angles_and_rates(message)
+        else:
+            angles, rates = (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate)
+        has_both = not any(map(math.isnan, (*angles, *rates)))
+        if self._is_selected(message.gimbal_device_id) and not has_both:  # The firmware ignores angles with rates.
+            roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate = map(math.degrees, (*angles, *rates))
+            self._manage(message.flags, (roll, pitch, yaw), (roll_rate, pitch_rate, yaw_rate))
+
+    def _manage(self, flags: int, angles: Angles, rates: Angles) -> int:
         """Apply GIMBAL_MANAGER_FLAGS with angles or rates. Values that are not given are NaN."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         (_, pitch, yaw), (_, pitch_rate, yaw_rate) = angles, rates
@@ -215,31 +269,33 @@ class ArduPilotGimbal:
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
-    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
-        if not self.is_fitted:
-            return None
+    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus:
+        # The reported yaw is relative to the nose, even with YAW_LOCK.
+        flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
+        if self.mode == MavMountMode.RETRACT:
+            flags |= GimbalDeviceFlags.RETRACT
+        elif self.mode == MavMountMode.NEUTRAL:
+            flags |= GimbalDeviceFlags.NEUTRAL
+        elif self.mode in _FROM_NORTH or self.target.is_from_north:
+            flags |= GimbalDeviceFlags.YAW_LOCK
         roll, pitch, yaw = map(math.radians, self.angles)
         unknown = math.nan
         return m.GimbalDeviceAttitudeStatus(
-            target_system=0, target_component=0, time_boot_ms=self._vehicle.time_boot_ms, flags=_device_flags(self),
+            target_system=0, target_component=0, time_boot_ms=self._vehicle.time_boot_ms, flags=flags,
             q=quaternion_from_euler(roll, pitch, yaw), angular_velocity_x=unknown, angular_velocity_y=unknown,
             angular_velocity_z=unknown, failure_flags=0, delta_yaw=unknown, delta_yaw_velocity=unknown,
             gimbal_device_id=_DEVICE_ID,
         )  # fmt: skip
 
-    def manager_information(self) -> m.GimbalManagerInformation | None:
-        if not self.is_fitted:
-            return None
+    def manager_information(self) -> m.GimbalManagerInformation:
         limits = (
-            math.radians(self.setting(f"MNT1_{axis}_{end}"))
+            math.radians(self._parameters[f"MNT1_{axis}_{end}"])
             for axis in ("ROLL", "PITCH", "YAW")
             for end in ("MIN", "MAX")
         )
         return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
-    def manager_status(self) -> m.GimbalManagerStatus | None:
-        if not self.is_fitted:
-            return None
+    def manager_status(self) -> m.GimbalManagerStatus:
         flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
         if self.is_yaw_locked:
             flags |= GimbalManagerFlags.YAW_LOCK
@@ -249,15 +305,3 @@ class ArduPilotGimbal:
             primary_control_sysid=system, primary_control_compid=component, secondary_control_sysid=0,
             secondary_control_compid=0,
         )  # fmt: skip
-
-
-def _device_flags(gimbal: ArduPilotGimbal) -> int:
-    # The reported yaw is relative to the nose, even with YAW_LOCK.
-    flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
-    if gimbal.mode == MavMountMode.RETRACT:
-        flags |= GimbalDeviceFlags.RETRACT
-    elif gimbal.mode == MavMountMode.NEUTRAL:
-        flags |= GimbalDeviceFlags.NEUTRAL
-    elif gimbal.mode in _FROM_NORTH or gimbal.target.is_from_north:
-        flags |= GimbalDeviceFlags.YAW_LOCK
-    return flags

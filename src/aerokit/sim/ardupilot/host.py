@@ -56,6 +56,7 @@ class ArduPilotMode:
 
     def __init__(self, vehicle: Any) -> None:
         self.vehicle = vehicle
+        self._place: Ned | None = None  # place to go to or to circle; None without one
 
     def enter(self, *, force: bool) -> bool:
         """Send the entry texts and start the mode. Return False to refuse the mode.
@@ -86,13 +87,30 @@ class ArduPilotMode:
     def resume(self) -> bool:
         return False
 
-    def go_to(self, position: Ned) -> None:
-        """Go to a point of the world frame and stay there. Only the guided mode implements this method."""
-        raise NotImplementedError
-
     @property
     def destination(self) -> Ned | None:
-        return None
+        return self._place
+
+
+class GuidedMode(ArduPilotMode):
+    """Base of the modes GUIDED, which follow set-points. The vehicle registers the handlers of set-point messages."""
+
+    @property
+    def is_active(self) -> bool:
+        return self.vehicle.mode is self
+
+    def go_to(self, position: Ned) -> None:
+        """Go to a point of the world frame and stay there."""
+        raise NotImplementedError
+
+    def on_local_target(self, message: m.SetPositionTargetLocalNed, _: Channel, /) -> None:
+        raise NotImplementedError
+
+    def on_global_target(self, message: m.SetPositionTargetGlobalInt, _: Channel, /) -> None:
+        raise NotImplementedError
+
+    def on_attitude_target(self, message: m.SetAttitudeTarget, _: Channel, /) -> None:
+        raise NotImplementedError
 
 
 def variant(
@@ -134,8 +152,6 @@ _ARMING_DELAY_S = 2.0
 _SPOOL_UP_S = 1.3
 _SPOOL_DOWN_S = 1.1
 _HOVER_THROTTLE, _IDLE_THROTTLE = 0.36, 0.05
-_ELECTRONICS_A = 0.08  # current of the electronics while armed
-_AMPERES_AT_FULL = 78.0
 _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 
 
@@ -144,6 +160,10 @@ class ArduPilotMotors:
 
     ``spool`` is 0 for idle or stopped motors and 1 for motors that can lift. It rises while ``spool_up_requested``.
     """
+
+    ELECTRONICS_A: ClassVar[float] = 0.08
+    """Current of the electronics while armed."""
+    AMPERES_AT_FULL: ClassVar[float] = 78.0
 
     def __init__(self, vehicle: Any) -> None:
         self.vehicle = vehicle
@@ -165,8 +185,8 @@ class ArduPilotMotors:
 
     @property
     def current_a(self) -> float:
-        electronics_a = _ELECTRONICS_A if self.is_armed else 0.0
-        return electronics_a + self.throttle * _AMPERES_AT_FULL
+        electronics_a = self.ELECTRONICS_A if self.is_armed else 0.0
+        return electronics_a + abs(self.throttle) * self.AMPERES_AT_FULL
 
     @property
     def pwm(self) -> int:
@@ -222,7 +242,7 @@ class ArduPilotMissionHost(Protocol):
     nav_index: int
 
     @property
-    def is_being_flown(self) -> bool: ...
+    def is_running(self) -> bool: ...
     @property
     def is_present(self) -> bool: ...
     def set_current(self, index: int) -> bool: ...
@@ -240,10 +260,6 @@ class ArduPilotRadioHost(Protocol):
     @property
     def is_receiving(self) -> bool: ...
     def override(self, pulses: Mapping[int, int]) -> None: ...
-
-
-class ArduPilotFailsafesHost(Protocol):
-    ground_station_seen_at: float
 
 
 class ArduPilotFenceHost(Protocol):
@@ -273,18 +289,16 @@ class ArduPilotHost(SimulatedAutopilot):
     uid: bytes
     motors: ArduPilotMotors
     mode: ArduPilotMode
+    guided: GuidedMode
+    ground_station_seen_at: float
+    """Time of the last heartbeat, RC override or MANUAL_CONTROL of the ground station MAV_GCS_SYSID; NaN before."""
     is_initialised: bool
     is_landed: bool
     navigation: ArduPilotNavigationHost
     mission: ArduPilotMissionHost
     missions: ArduPilotMissionsHost
-    failsafes: ArduPilotFailsafesHost
     fence: ArduPilotFenceHost
     rc: ArduPilotRadioHost
-
-    @property
-    def guided(self) -> ArduPilotMode:
-        raise NotImplementedError
 
     @property
     def is_armed(self) -> bool:

@@ -27,23 +27,25 @@ class ItemList:
 
     name: ClassVar[str]
     """Name of the list in status texts."""
+    capacity: ClassVar[int]
+    """Maximum number of items."""
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity  # The maximum number of items.
+    def __init__(self) -> None:
+        self._items: list[MissionItem] = []
 
     @property
     def count(self) -> int:
-        raise NotImplementedError
+        return len(self._items)
 
     def items(self) -> list[MissionItem]:
-        items = map(self.item, range(self.count))
+        items = map(self.item, range(len(self._items)))
         return [item for item in items if item is not None]
 
     def item(self, seq: int) -> MissionItem | None:
-        raise NotImplementedError
+        return self._items[seq] if seq < len(self._items) else None
 
     def begin(self, count: int) -> None:
-        raise NotImplementedError
+        del self._items[count:]
 
     def begin_update(self) -> None:
         """Start a partial upload."""
@@ -59,41 +61,36 @@ class ItemList:
 
     def clear(self) -> bool:
         """Delete all items. Return False if this is not allowed at present."""
-        raise NotImplementedError
+        self._items.clear()
+        return True
 
 
 class CommandList(ItemList):
     """The list of mission commands. Item 0 is home, which the function ``home`` returns at each download."""
 
     name = "Mission"
+    capacity: ClassVar[int] = 650
 
-    def __init__(
-        self, capacity: int, home: Callable[[], MissionItem], is_running: Callable[[], bool], kind: Kind
-    ) -> None:
-        super().__init__(capacity)
+    def __init__(self, home: Callable[[], MissionItem], is_running: Callable[[], bool], kind: Kind) -> None:
+        super().__init__()  # The item at index 0 is a placeholder for home.
         self._kind: Kind = kind
         self._home = home
         self._is_running = is_running
-        self._commands: list[MissionItem] = []  # The item at index 0 is a placeholder for home.
         self.version: int = 0  # Every change of an item increments the version.
-
-    @property
-    def count(self) -> int:
-        return len(self._commands)
 
     def item(self, seq: int) -> MissionItem | None:
         return self._home() if seq == 0 else self.command(seq)  # Home can be read even if there is no mission.
 
     def command(self, index: int) -> MissionItem | None:
-        return self._commands[index] if 0 < index < len(self._commands) else None
+        return self._items[index] if 0 < index < len(self._items) else None
 
     def add_home(self) -> None:
         """Add home as item 0 of an empty mission."""
-        if not self._commands:
-            self._commands.append(self._home())
+        if not self._items:
+            self._items.append(self._home())
 
     def begin(self, count: int) -> None:
-        del self._commands[count:]
+        super().begin(count)
         self.version += 1
 
     def put(self, seq: int, item: MissionItem, last: int) -> None:
@@ -104,17 +101,14 @@ class CommandList(ItemList):
         self._write(seq, stored_item)
 
     def _write(self, seq: int, stored_item: MissionItem) -> None:
-        count = len(self._commands)
-        has_space_beyond_home = self.capacity > 1  # Without it, even the upload of home (item 0) is refused.
-        has_space = has_space_beyond_home and seq < self.capacity
-        if seq > count or not has_space:
+        if seq > len(self._items) or seq >= self.capacity:
             raise ItemRefused(MavMissionResult.ERROR)
-        if seq == count:
+        if seq == len(self._items):
             # If the list is empty, the firmware adds home first, so this item becomes item 1 (AP_Mission.cpp, add_cmd).
             self.add_home()
-            self._commands.append(stored_item)
+            self._items.append(stored_item)
         elif seq != _HOME_SEQ:  # Item 0 is home, which is not stored.
-            self._commands[seq] = stored_item
+            self._items[seq] = stored_item
         self.version += 1
 
     def clear(self) -> bool:
@@ -138,32 +132,18 @@ class RallyList(ItemList):
     """The list of rally points. Their position, altitude (in whole metres) and altitude frame are stored."""
 
     name = "Rally"
-
-    def __init__(self, capacity: int) -> None:
-        super().__init__(capacity)
-        self._points: list[MissionItem] = []
-
-    @property
-    def count(self) -> int:
-        return len(self._points)
+    capacity: ClassVar[int] = 46
 
     def item(self, seq: int) -> MissionItem | None:
-        point = self._points[seq] if seq < len(self._points) else None
+        point = super().item(seq)
         # A rally point at latitude 0 and longitude 0 counts as missing.
         return None if point is None or (point.x, point.y) == (0, 0) else point
 
-    def begin(self, count: int) -> None:
-        del self._points[count:]
-
     def put(self, seq: int, item: MissionItem, last: int) -> None:
         stored_item = _stored_rally_point(item)
-        if seq > len(self._points) or seq >= self.capacity:
+        if seq > len(self._items) or seq >= self.capacity:
             raise ItemRefused(MavMissionResult.ERROR)
-        self._points[seq : seq + 1] = [stored_item]  # replaces the point, or appends it at the end
-
-    def clear(self) -> bool:
-        self._points.clear()
-        return True
+        self._items[seq : seq + 1] = [stored_item]  # replaces the point, or appends it at the end
 
 
 def _stored_rally_point(item: MissionItem) -> MissionItem:
@@ -202,31 +182,23 @@ class FenceList(ItemList):
     """The list of fence items. During an upload, `item` still reads the old fence."""
 
     name = "Fence"
+    capacity: ClassVar[int] = _STORAGE_BYTES // _BYTES_PER_POINT
 
-    def __init__(
-        self, on_total: Callable[[int], None] = lambda _: None, capacity: int = _STORAGE_BYTES // _BYTES_PER_POINT
-    ) -> None:
-        super().__init__(capacity)
+    def __init__(self, on_total: Callable[[int], None]) -> None:
+        super().__init__()
         self._on_total = on_total  # called with the new FENCE_TOTAL after each change of the stored fence
-        self._stored: list[MissionItem] = []
         # Items of the running upload, with None for each missing item. None if no upload is running.
         self._uploaded: list[MissionItem | None] | None = None
 
     @property
     def count(self) -> int:
-        return len(self._stored if self._uploaded is None else self._uploaded)
-
-    def items(self) -> list[MissionItem]:
-        return list(self._stored)
-
-    def item(self, seq: int) -> MissionItem | None:
-        return self._stored[seq] if seq < len(self._stored) else None
+        return len(self._items if self._uploaded is None else self._uploaded)
 
     def begin(self, count: int) -> None:
         self._uploaded = [None for _ in range(count)]
 
     def begin_update(self) -> None:
-        self._uploaded = list(self._stored)
+        self._uploaded = list(self._items)
 
     def put(self, seq: int, item: MissionItem, last: int) -> None:
         assert self._uploaded is not None  # `begin` has created the list with the announced number of items.
@@ -246,7 +218,7 @@ class FenceList(ItemList):
         return True
 
     def _store(self, items: Sequence[MissionItem]) -> None:
-        self._stored = list(items)
+        self._items = list(items)
         # Fewer than three vertices and circles count as 0 (AC_PolyFence_loader.cpp, write_fence).
         zone_points = sum(item.command != Cmd.NAV_FENCE_RETURN_POINT for item in items)
         self._on_total(zone_points + 2 if zone_points >= 3 else 0)
@@ -288,6 +260,7 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
     missing = 0  # number of vertices that must still follow
     has_return_point = False
     for item in items:
+        number = _TYPE_NUMBERS[item.command]
         if item.command in POLYGON_CORNERS:
             if item.param1 < 3:
                 return f"Invalid vertex count ({item.param1:.0f})"
@@ -296,12 +269,12 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
                 vertices = item.param1
                 missing = int(item.param1)
             elif item.command != polygon_type:
-                return f"Received incorrect vertex type (want={_number(polygon_type)} got={_number(item.command)})"
+                return f"Received incorrect vertex type (want={_TYPE_NUMBERS[polygon_type]} got={number})"
             elif item.param1 != vertices:
                 return f"Unexpected vertex count want={vertices:.0f} got={item.param1:.0f}"
             missing -= 1
         elif missing:
-            return f"Received incorrect type (want={_number(polygon_type)} got={_number(item.command)})"
+            return f"Received incorrect type (want={_TYPE_NUMBERS[polygon_type]} got={number})"
         elif item.command in CIRCLES and not item.param1 > 0:
             return "Non-positive circle radius"
         elif item.command == Cmd.NAV_FENCE_RETURN_POINT:
@@ -313,10 +286,6 @@ def _fence_problem(items: Sequence[MissionItem]) -> str | None:
         except ItemRefused:
             return "Bad lat or lon"
     return "Incorrect item count" if missing else None
-
-
-def _number(command: int) -> int:
-    return _TYPE_NUMBERS.get(command, 0)
 
 
 def _storage_needed(items: Sequence[MissionItem]) -> int:

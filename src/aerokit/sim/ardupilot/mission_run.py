@@ -46,8 +46,20 @@ class MissionCommand(NamedTuple):
     item: MissionItem
 
 
+class SupportedCommand(NamedTuple):
+    """How a mode executes a mission command: by default, it does nothing and is complete at once."""
+
+    start: Callable[[MissionItem], None] = lambda _: None
+    is_done: Callable[[int, MissionItem], bool] = lambda _index, _item: True
+    """Called at every tick with the index of the command and the command. Returns True once it is complete."""
+
+
+def never(_index: int, _item: MissionItem) -> bool:
+    return False
+
+
 class MissionMode(ArduPilotMode):
-    """Base of the AUTO modes. A subclass fills ``handlers`` with handlers of the mission commands that it supports."""
+    """Base of the AUTO modes. A subclass adds the mission commands that it supports to ``commands``."""
 
     needs_mission = True
     can_change_speed = True
@@ -59,7 +71,12 @@ class MissionMode(ArduPilotMode):
         """True once MISSION_START or a raised throttle permits a take-off from the ground."""
         self.is_paused: bool = False
         self.is_waiting_for_origin: bool = False  # True until the mission starts, which needs the estimator's origin
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {}
+        self._condition_started_at = 0.0
+        self.commands: dict[int, SupportedCommand] = {
+            Cmd.CONDITION_DELAY: SupportedCommand(self._wait, self._has_waited),
+            Cmd.DO_SET_HOME: SupportedCommand(self._set_home),
+            Cmd.DO_FENCE_ENABLE: SupportedCommand(),
+        }
 
     def on_disarmed(self) -> None:
         # Disarming has reset the progress. `update` starts the first command, which waits until the vehicle is armed.
@@ -99,14 +116,32 @@ class MissionMode(ArduPilotMode):
 
     def start_command(self, item: MissionItem) -> bool:
         """Start a mission command. Return False to skip a command that is not supported."""
-        handler = self.handlers.get(item.command)
-        if handler is not None:
-            handler(item)
-        return handler is not None
+        command = self.commands.get(item.command)
+        if command is not None:
+            command.start(item)
+        return command is not None
 
-    def warn_if_unknown(self, item: MissionItem) -> None:
-        if item.command not in self.handlers:
+    def _is_done(self, index: int, item: MissionItem) -> bool:
+        if item.command not in self.commands:
             self.vehicle.send_text(MavSeverity.WARNING, f"Skipping invalid cmd #{item.command}")
+            return True
+        return self.commands[item.command].is_done(index, item)
+
+    def _wait(self, item: MissionItem) -> None:
+        self._condition_started_at = self.vehicle.now
+
+    def _has_waited(self, _index: int, item: MissionItem) -> bool:
+        return bool(self.vehicle.now - self._condition_started_at > max(0.0, item.param1))
+
+    def _set_home(self, item: MissionItem) -> None:
+        vehicle = self.vehicle
+        # On Plane, unlike on the other vehicles, the coordinates 0, 0, 0 are an ordinary position.
+        has_no_place = (item.x, item.y, item.z) == (0, 0, 0) and vehicle.KIND != "plane"
+        point: Ned | None = vehicle.motion.place
+        if item.param1 != 1 and not has_no_place:
+            point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
+        if point is not None:
+            vehicle.navigation.set_home(point, lock=False)
 
 
 def is_navigation(item: MissionItem) -> bool:
@@ -134,30 +169,17 @@ class MissionRun:
     def is_running(self) -> bool:
         return self._state == MissionState.ACTIVE
 
-    @property
-    def is_being_flown(self) -> bool:
-        return self.is_running and self._vehicle.motors.is_armed
-
-    @property
-    def state(self) -> int:
-        if not self.is_present:
-            return MissionState.NO_MISSION
-        is_paused = self.is_running and self._mode.is_paused
-        return MissionState.PAUSED if is_paused else self._state
-
-    @property
-    def count(self) -> int:
-        """Number of commands, without home."""
-        return max(0, self._list.count - 1)
-
     def message(self, seq: int | None = None) -> MissionCurrent:
         seq = self.nav_index if seq is None else seq
-        return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
+        total = max(0, self._list.count - 1)  # Home does not count.
+        state = MissionState.PAUSED if self.is_running and self._mode.is_paused else self._state
+        if not self.is_present:
+            state = MissionState.NO_MISSION
+        return MissionCurrent(seq, total, state, int(self._vehicle.mode.needs_mission))
 
     def starts_with_take_off(self) -> bool:
         is_resumed = self.nav_index != 0 and not self._restarts
-        first_index = self.nav_index if is_resumed else _FIRST
-        return self.is_take_off(first_index)
+        return self.is_take_off(self.nav_index if is_resumed else _FIRST)
 
     def is_take_off(self, index: int) -> bool:
         """Return True if the first navigation command from ``index`` on is a take-off. Delays are skipped."""
@@ -190,19 +212,14 @@ class MissionRun:
     def start_or_resume(self) -> None:
         """Start the mission again or resume it, as MIS_RESTART selects."""
         can_resume = self._state != MissionState.COMPLETE and self._list.command(self.nav_index) is not None
+        self._state = MissionState.ACTIVE
         if self._restarts or not can_resume:
-            self._start()
+            self.reset()
+            self._start_next_navigation()
         else:
-            self._state = MissionState.ACTIVE
             # A running "do" command precedes the navigation command, so the mission resumes at the "do" command.
             resume_index = self.nav_index if self._running_do is None else self._running_do.seq
             self.set_current(resume_index)
-
-    def _start(self) -> None:
-        self._state = MissionState.ACTIVE
-        self.reset()
-        if not self._start_next_navigation():
-            self._complete()
 
     def stop(self) -> None:
         """Stop the mission. `start_or_resume` can resume it."""
@@ -236,10 +253,7 @@ class MissionRun:
             self._jumps.clear()
         index = max(index, _FIRST)
         if self.is_running:
-            is_started = self._start_next_navigation(index)
-            if not is_started:  # No navigation command follows, so the mission is over.
-                self._complete()
-            return is_started
+            return self._start_next_navigation(index)
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
@@ -270,7 +284,6 @@ class MissionRun:
         if self._running_nav is None or self._is_complete(self.nav_index, self._running_nav):
             self._running_nav = None
             if not self._start_next_navigation():
-                self._complete()
                 return
         if self._running_do is None:
             self._start_next_do()
@@ -278,7 +291,7 @@ class MissionRun:
             self._running_do = None
 
     def _start_next_navigation(self, start: int = 0) -> bool:
-        """Start the next navigation command. Return False if there is none.
+        """Start the next navigation command. If there is none, end the mission and return False.
 
         The search begins at the index ``start``, or after the current command if ``start`` is 0.
         """
@@ -289,7 +302,7 @@ class MissionRun:
         for _ in range(_MAX_STEPS):
             command = self._next_command(index, count_jumps=True)
             if command is None:
-                return False
+                break
             index = command.seq + 1
             if is_navigation(command.item):
                 self.nav_index = command.seq
@@ -299,6 +312,8 @@ class MissionRun:
                     return True
             elif self._running_do is None:
                 self._start_do(command)
+        self._state = MissionState.COMPLETE
+        self._mode.end_mission()
         return False
 
     def _start_next_do(self) -> None:
@@ -325,10 +340,6 @@ class MissionRun:
 
     def _is_complete(self, index: int, item: MissionItem) -> bool:
         return item.command in _INSTANT or self._mode.is_complete(index, item)
-
-    def _complete(self) -> None:
-        self._state = MissionState.COMPLETE
-        self._mode.end_mission()
 
     def _next_command(self, index: int, *, count_jumps: bool) -> MissionCommand | None:
         """Return the first command at or after ``index``. Jump commands are followed, not returned.
@@ -388,14 +399,3 @@ def place_of(vehicle: ArduPilotHost, item: MissionItem, current: Ned) -> Ned:
     if item.z == 0:
         _, _, down = current
     return (north, east, down)
-
-
-def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
-    """Execute DO_SET_HOME of a mission."""
-    # On Plane, unlike on the other vehicles, the coordinates 0, 0, 0 are an ordinary position.
-    has_no_place = (item.x, item.y, item.z) == (0, 0, 0) and vehicle.KIND != "plane"
-    point: Ned | None = vehicle.motion.place
-    if item.param1 != 1 and not has_no_place:
-        point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)
-    if point is not None:
-        vehicle.navigation.set_home(point, lock=False)

@@ -34,7 +34,6 @@ from aerokit.sim.missions import float32
 from aerokit.sim.vehicle import sender_of
 
 _DEGREE = 1e7
-_MAX_COMMANDS, _MAX_RALLY_POINTS = 650, 46
 _GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3
 _FENCE_UPDATE_INTERVAL_S = 0.1
 
@@ -49,14 +48,12 @@ class ArduPilotMissionServer(MissionServer):
     def __init__(self, vehicle: ArduPilotHost) -> None:
         super().__init__(vehicle)
         self._vehicle = vehicle
-        self.commands: CommandList = CommandList(
-            _MAX_COMMANDS, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
-        )
+        self.commands: CommandList = CommandList(self._home, self._is_flying, vehicle.KIND)
         """The mission."""
         self.fence: FenceList = FenceList(self._on_fence_total)
         self._fence_total = 0
         self._was_fence_stored = False  # since the boot
-        self.rally: RallyList = RallyList(_MAX_RALLY_POINTS)
+        self.rally: RallyList = RallyList()
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,
             MavMissionType.FENCE: self.fence,
@@ -92,6 +89,9 @@ class ArduPilotMissionServer(MissionServer):
             return refused.result
         return Result.ACCEPTED
 
+    def _is_flying(self) -> bool:
+        return self._vehicle.mission.is_running and self._vehicle.motors.is_armed
+
     def _home(self) -> MissionItem:
         home = self._vehicle.navigation.home
         if home is None:
@@ -116,14 +116,9 @@ class ArduPilotMissionServer(MissionServer):
         return self._lists[mission_type].capacity
 
     def count(self, mission_type: int) -> int:
-        if mission_type == MavMissionType.FENCE and self._is_fence_hidden:
-            return 0
-        return self._lists[mission_type].count
-
-    @property
-    def _is_fence_hidden(self) -> bool:
-        # The firmware counts the items in its storage at the end of its boot, or when it stores a fence.
-        return not self._vehicle.is_initialised and not self._was_fence_stored
+        # The firmware counts the items of a fence at the end of its boot, or when it stores a fence.
+        is_counted = self._vehicle.is_initialised or self._was_fence_stored
+        return self._lists[mission_type].count if is_counted or mission_type != MavMissionType.FENCE else 0
 
     def _key(self, mission_type: int) -> int:
         return mission_type

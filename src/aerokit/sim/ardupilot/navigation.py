@@ -9,6 +9,7 @@ from aerokit.mavlink.enums import EkfStatusFlags as Ekf
 from aerokit.mavlink.enums import GpsFixType, MavMissionType, MavSeverity
 from aerokit.sim.ardupilot.external import ArduPilotExternal
 from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.missions import distance_to_segment, dot_product, point_along, vector_between
 from aerokit.sim.motion import GlobalPoint, LocalFrame, Ned
 
 # These bits are plain integers, because every tick tests them and operators of enum flags are slow.
@@ -263,9 +264,8 @@ class SmartPath:
     point, is missing for 15 s, the path is deactivated and SMART_RTL is refused.
     """
 
-    def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self._only_armed = only_armed  # True if the path is recorded only while the vehicle is armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
         self._good_at = -math.inf  # time of the last good position
@@ -315,7 +315,8 @@ class SmartPath:
             if not self._is_started and vehicle.navigation.has_position:
                 self.reset()
             return
-        if vehicle.mode.returns_on_path or (self._only_armed and not vehicle.motors.is_armed):
+        is_disarmed_copter = vehicle.KIND == "copter" and not vehicle.motors.is_armed  # ArduRover records always.
+        if vehicle.mode.returns_on_path or is_disarmed_copter:
             return
         if not vehicle.navigation.has_position:
             if vehicle.now - self._good_at > _FAILURE_TIMEOUT_S:
@@ -360,7 +361,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     """
     if len(path) < 3:
         return list(path)
-    distances = [_distance_to_line(point, path[0], path[-1]) for point in path[1:-1]]
+    distances = [distance_to_segment(point, path[0], path[-1]) for point in path[1:-1]]
     farthest = max(range(len(distances)), key=distances.__getitem__)
     if distances[farthest] <= tolerance:
         return [path[0], path[-1]]
@@ -386,38 +387,11 @@ def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
     return points
 
 
-def _vector(start: Ned, end: Ned) -> Ned:
-    start_north, start_east, start_down = start
-    north, east, down = end
-    return (north - start_north, east - start_east, down - start_down)
-
-
-def _dot(first: Ned, second: Ned) -> float:
-    first_north, first_east, first_down = first
-    north, east, down = second
-    return first_north * north + first_east * east + first_down * down
-
-
-def _along(start: Ned, line: Ned, share: float) -> Ned:
-    start_north, start_east, start_down = start
-    north, east, down = line
-    return (start_north + share * north, start_east + share * east, start_down + share * down)
-
-
-def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
-    line = _vector(start, end)
-    squared_length = _dot(line, line)
-    share = 0.0  # Place on the line that is nearest to the point: 0 is the start, 1 the end.
-    if squared_length != 0.0:
-        share = max(0.0, min(1.0, _dot(_vector(start, point), line) / squared_length))
-    return math.dist(point, _along(start, line, share))
-
-
 def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[float, Ned] | None:
     """Return (distance, midpoint) of two line segments, or None if they are parallel."""
-    line1, line2, between = _vector(start1, end1), _vector(start2, end2), _vector(start2, start1)
-    dot11, dot12, dot22 = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
-    dot1, dot2 = _dot(line1, between), _dot(line2, between)
+    line1, line2, between = vector_between(start1, end1), vector_between(start2, end2), vector_between(start2, start1)
+    dot11, dot12, dot22 = dot_product(line1, line1), dot_product(line1, line2), dot_product(line2, line2)
+    dot1, dot2 = dot_product(line1, between), dot_product(line2, between)
     determinant = dot11 * dot22 - dot12 * dot12
     are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # True for a segment without a length.
     if are_nearly_parallel:
@@ -427,5 +401,5 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     share1 = max(0.0, min(1.0, (dot12 * dot2 - dot22 * dot1) / determinant))
     share2 = max(0.0, min(1.0, (dot12 * share1 + dot2) / dot22))
     share1 = max(0.0, min(1.0, (dot12 * share2 - dot1) / dot11))
-    place1, place2 = _along(start1, line1, share1), _along(start2, line2, share2)
-    return math.dist(place1, place2), _along(place1, _vector(place1, place2), 0.5)
+    place1, place2 = point_along(start1, line1, share1), point_along(start2, line2, share2)
+    return math.dist(place1, place2), point_along(place1, vector_between(place1, place2), 0.5)

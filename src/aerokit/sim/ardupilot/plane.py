@@ -22,7 +22,7 @@ from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, variant
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided, PlaneSetpoints, guided_commands
+from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided
 from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneModeBase, PlaneNavigatingMode
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
@@ -53,15 +53,11 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
         return [text for failed, text in checks if failed]
 
 
-_FULL_AMPERES = 25.0
-
-
 class PlaneEngine(ArduPilotMotors):
     """The engine of a plane, whose throttle is that of the motion model."""
 
-    @property
-    def current_a(self) -> float:
-        return self.throttle * _FULL_AMPERES
+    ELECTRONICS_A: ClassVar[float] = 0.0
+    AMPERES_AT_FULL: ClassVar[float] = 25.0
 
     def update(self, dt: float, *, landed: bool) -> None:
         self.throttle: float = self.vehicle.motion.throttle if self.is_armed and not landed else 0.0
@@ -107,6 +103,8 @@ class SimulatedPlane(PlaneHost):
     rotors, parachutes.
     """
 
+    guided: PlaneGuided  # pyright: ignore[reportIncompatibleVariableOverride]
+
     KIND: ClassVar[Kind] = "plane"
     FIRMWARE: ClassVar[str] = "ArduPlane"
     MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
@@ -119,7 +117,6 @@ class SimulatedPlane(PlaneHost):
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = PlaneFailsafes
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = PlaneFence
     MOTORS: ClassVar[type[ArduPilotMotors]] = PlaneEngine
-    SETPOINTS: ClassVar[type[Any]] = PlaneSetpoints
 
     fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -135,7 +132,11 @@ class SimulatedPlane(PlaneHost):
             MavCmd.MISSION_START: self._start_mission,
             MavCmd.DO_REPOSITION: self._reposition,
             MavCmd.DO_CHANGE_SPEED: self._change_speed,
-            **guided_commands(self),
+            **dict.fromkeys(
+                (MavCmd.GUIDED_CHANGE_SPEED, MavCmd.GUIDED_CHANGE_ALTITUDE, MavCmd.GUIDED_CHANGE_HEADING),
+                lambda command: self.guided.on_guided_command(command),
+            ),
+            MavCmd.DO_CHANGE_ALTITUDE: lambda command: self.guided.change_target_altitude(command),
             MavCmd.DO_FLIGHTTERMINATION: self._terminate,
         }
 
@@ -143,13 +144,6 @@ class SimulatedPlane(PlaneHost):
         if number in _LIFTING_MODES:
             return MavSeverity.INFO, "Q_ENABLE 0"
         return super().text_for_unknown_mode(number)
-
-    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
-        return "Flight mode change failed"
-
-    @property
-    def guided(self) -> PlaneGuided:
-        return self.mode_of(PlaneGuided)
 
     @property
     def base_mode(self) -> int:

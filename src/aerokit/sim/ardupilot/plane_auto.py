@@ -7,7 +7,6 @@ servo and camera commands. Other commands are skipped.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from aerokit.mavlink import messages as m
@@ -16,11 +15,11 @@ from aerokit.mavlink.enums import HeadingType, MavFrame, MavResult, MavSeverity,
 from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES
-from aerokit.sim.ardupilot.mission_run import MissionMode, set_home_from
+from aerokit.sim.ardupilot.host import ABSOLUTE_FRAMES, GuidedMode
+from aerokit.sim.ardupilot.mission_run import MissionMode, SupportedCommand, never
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, to_int
+from aerokit.sim.commands import ReceivedCommand, constrained, to_int
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
@@ -41,20 +40,24 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._on_circle_since = math.nan  # NaN before the plane has reached the circle
         self._turned_rad = 0.0  # angle flown around the circle
         self._last_bearing = 0.0  # bearing from the center of the circle at the last tick
-        self._condition_started_at = 0.0
         self._leg_start: Ned = (0.0, 0.0, 0.0)  # start of the straight line to the current waypoint
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
-            **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
-            **dict.fromkeys((Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME), self._start_loiter),
-            **dict.fromkeys((Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT), self._start_loiter),
-            Cmd.NAV_LAND: self._start_landing,
-            Cmd.NAV_RETURN_TO_LAUNCH: self._return,
-            Cmd.CONDITION_DELAY: self._wait,
-            Cmd.DO_CHANGE_SPEED: self._change_speed,
-            Cmd.DO_SET_HOME: lambda item: set_home_from(plane, item),
-            **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START, Cmd.DO_FENCE_ENABLE), lambda _: None),
-        }
+        self.commands.update(
+            {
+                Cmd.NAV_TAKEOFF: SupportedCommand(lambda item: self._go(item, _CLIMB), self._has_climbed),
+                **dict.fromkeys(
+                    (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT),
+                    SupportedCommand(lambda item: self._go(item, _FLY), self._has_passed),
+                ),
+                Cmd.NAV_LOITER_UNLIM: SupportedCommand(self._start_loiter, never),
+                Cmd.NAV_LOITER_TIME: SupportedCommand(self._start_loiter, self._has_circled_for_time),
+                Cmd.NAV_LOITER_TURNS: SupportedCommand(self._start_loiter, self._has_turned),
+                Cmd.NAV_LOITER_TO_ALT: SupportedCommand(self._start_loiter, self._is_at_height),
+                Cmd.NAV_LAND: SupportedCommand(self._start_landing, never),
+                Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(self._return, never),
+                Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+                **dict.fromkeys((Cmd.DO_LAND_START, Cmd.DO_RETURN_PATH_START), SupportedCommand()),
+            }
+        )
 
     @property
     def is_taking_off(self) -> bool:  # type: ignore[override]
@@ -131,28 +134,21 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.info("Mission complete, changing mode to RTL")
             self.vehicle.set_mode(PlaneMode.RTL)
 
-    def _is_done(self, index: int, item: MissionItem) -> bool:
-        plane, command = self.vehicle, item.command
-        if command == Cmd.NAV_TAKEOFF:
-            is_altitude_reached = plane.wing.down <= self._place_down
-            return self._report_if(is_altitude_reached, f"Takeoff complete at {plane.altitude_m:.2f}m")
-        if command in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT):
-            return self._has_passed(index)
-        if command == Cmd.NAV_LOITER_TIME:
-            # Before the plane has reached the circle, the time is NaN, and the comparison is false.
-            time_on_circle_s = plane.now - self._on_circle_since
-            return self._report_if(time_on_circle_s >= item.param1, "Loiter time complete")
-        if command == Cmd.NAV_LOITER_TURNS:
-            return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
-        if command == Cmd.NAV_LOITER_TO_ALT:
-            is_at_height = abs(plane.wing.down - self._place_down) < _REACHED_HEIGHT_M
-            return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
-        if command == Cmd.CONDITION_DELAY:
-            return plane.now - self._condition_started_at > max(0.0, item.param1)
-        if command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH):
-            return False
-        self.warn_if_unknown(item)
-        return True
+    def _has_climbed(self, _index: int, _item: MissionItem) -> bool:
+        plane = self.vehicle
+        return self._report_if(plane.wing.down <= self._place_down, f"Takeoff complete at {plane.altitude_m:.2f}m")
+
+    def _has_circled_for_time(self, _index: int, item: MissionItem) -> bool:
+        # Before the plane has reached the circle, the time is NaN, and the comparison is false.
+        time_on_circle_s = self.vehicle.now - self._on_circle_since
+        return self._report_if(time_on_circle_s >= item.param1, "Loiter time complete")
+
+    def _has_turned(self, _index: int, item: MissionItem) -> bool:
+        return self._report_if(self._turned_rad >= 2 * math.pi * item.param1, "Loiter orbits complete")
+
+    def _is_at_height(self, _index: int, _item: MissionItem) -> bool:
+        is_at_height = abs(self.vehicle.wing.down - self._place_down) < _REACHED_HEIGHT_M
+        return self._report_if(is_at_height and self._is_on_circle, "Loiter to alt complete")
 
     @property
     def _place_down(self) -> float:
@@ -165,7 +161,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.info(text)
         return is_complete
 
-    def _has_passed(self, index: int) -> bool:
+    def _has_passed(self, index: int, _item: MissionItem) -> bool:
         assert self._place is not None
         wing = self.vehicle.wing
         north, east, _ = self._place
@@ -216,9 +212,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         # ArduPlane changes the mode to RTL (commands_logic.cpp, start_command). The mode change stops the mission.
         self.vehicle.set_mode(PlaneMode.RTL)
 
-    def _wait(self, _: MissionItem) -> None:
-        self._condition_started_at = self.vehicle.now
-
     def _change_speed(self, item: MissionItem) -> None:
         if self.vehicle.is_valid_airspeed(item.param2):
             self.speed: float = item.param2
@@ -239,11 +232,11 @@ class _TimedValue:
     received_at: float
 
 
-class PlaneGuided(PlaneNavigatingMode):
+class PlaneGuided(PlaneNavigatingMode, GuidedMode):
     """GUIDED: flies to the target and circles there.
 
     A commanded course is valid until it is cancelled or the next target arrives. Bank, pitch and throttle of
-    SET_ATTITUDE_TARGET expire after three seconds each.
+    SET_ATTITUDE_TARGET expire after three seconds each. ArduPlane uses only the altitude of position targets.
     """
 
     number: int = PlaneMode.GUIDED
@@ -252,7 +245,7 @@ class PlaneGuided(PlaneNavigatingMode):
 
     def enter(self, *, force: bool) -> bool:
         self._climb_limit = _UNLIMITED_M_S
-        self._course: float | None = None
+        self._course: float | None = None  # course to fly in radians from north; None to fly to the target
         self._bank = self._pitch = self._throttle = _TimedValue(0.0, -math.inf)
         return super().enter(force=force)
 
@@ -267,11 +260,9 @@ class PlaneGuided(PlaneNavigatingMode):
             self._place = (north, east, down)
             self._climb_limit = climb_m_s
 
-    def change_course(self, course: float | None) -> None:
-        """Fly on a course in radians from north. With None, the plane circles again."""
-        self._course = course
-
-    def set_attitude(self, message: m.SetAttitudeTarget) -> None:
+    def on_attitude_target(self, message: m.SetAttitudeTarget, _channel: Channel) -> None:
+        if not self.is_active:
+            return
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
         # If the message gives an attitude without rates, the firmware uses both angles. Otherwise, it uses each angle
@@ -306,37 +297,19 @@ class PlaneGuided(PlaneNavigatingMode):
         bank = max(-limits.bank_rad, min(limits.bank_rad, self._bank.value)) if has_bank else 0.0
         wing.bank_and_climb(speed, bank, climb)
 
-
-class PlaneSetpoints:
-    """Handlers of set-point messages in GUIDED. ArduPlane uses only the altitude of position targets."""
-
-    def __init__(self, plane: PlaneHost) -> None:
-        self._plane = plane
-        plane.on(m.SetPositionTargetLocalNed, self._on_local)
-        plane.on(m.SetPositionTargetGlobalInt, self._on_global)
-        plane.on(m.SetAttitudeTarget, self._on_attitude)
-
-    @property
-    def _guided(self) -> PlaneGuided:
-        return self._plane.mode_of(PlaneGuided)
-
-    @property
-    def _is_guided(self) -> bool:
-        return self._plane.mode is self._guided
-
-    def _on_local(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
-        plane, target = self._plane, self._guided.destination
-        if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
+    def on_local_target(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
+        plane, target = self.vehicle, self.destination
+        if not self.is_active or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
             return
         _north, _east, target_down = target
         _north, _east, home_down = plane.home_or_ground
         down = target_down + message.z
-        self._guided.change_altitude(down)
+        self.change_altitude(down)
         plane.info(f"Change alt to {home_down - down:.1f}")
 
-    def _on_global(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
-        plane = self._plane
-        if not self._is_guided:
+    def on_global_target(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
+        plane = self.vehicle
+        if not self.is_active:
             return
         point = plane.world_point(0, 0, message.alt, message.coordinate_frame)  # Only the altitude is used.
         if point is None:
@@ -344,67 +317,51 @@ class PlaneSetpoints:
             plane.send_text(MavSeverity.WARNING, text)
         elif not message.type_mask & PositionMask.Z_IGNORE:
             _north, _east, down = point
-            self._guided.change_altitude(down)
+            self.change_altitude(down)
 
-    def _on_attitude(self, message: m.SetAttitudeTarget, _: Channel) -> None:
-        if self._is_guided:
-            self._guided.set_attitude(message)
+    def on_guided_command(self, command: ReceivedCommand) -> int:
+        """Execute a command that only GUIDED accepts."""
+        handlers = {
+            Cmd.GUIDED_CHANGE_SPEED: self._change_speed,
+            Cmd.GUIDED_CHANGE_ALTITUDE: self._change_altitude,
+            Cmd.GUIDED_CHANGE_HEADING: self._change_heading,
+        }
+        return handlers[Cmd(command.command)](command) if self.is_active else MavResult.FAILED
 
+    def _change_speed(self, command: ReceivedCommand) -> int:
+        if to_int(command.param1) != SpeedType.AIRSPEED:
+            return MavResult.DENIED
+        if not self.vehicle.is_valid_airspeed(command.param2):
+            return MavResult.FAILED
+        self.speed: float = command.param2
+        return MavResult.ACCEPTED
 
-def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
-    def in_guided(handler: Callable[[PlaneHost, PlaneGuided, ReceivedCommand], int]) -> CommandHandler:
-        def handle(command: ReceivedCommand) -> int:
-            guided = plane.mode_of(PlaneGuided)
-            return handler(plane, guided, command) if plane.mode is guided else MavResult.FAILED
-
-        return handle
-
-    return {
-        Cmd.GUIDED_CHANGE_SPEED: in_guided(_change_speed),
-        Cmd.GUIDED_CHANGE_ALTITUDE: in_guided(_change_altitude),
-        Cmd.GUIDED_CHANGE_HEADING: in_guided(_change_heading),
-        Cmd.DO_CHANGE_ALTITUDE: lambda command: _change_target_altitude(plane, command),
-    }
-
-
-def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    if to_int(command.param1) != SpeedType.AIRSPEED:
-        return MavResult.DENIED
-    if not plane.is_valid_airspeed(command.param2):
-        return MavResult.FAILED
-    guided.speed = command.param2
-    return MavResult.ACCEPTED
-
-
-def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    point = plane.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
-    if command.z in _INVALID_ALTITUDES or point is None:
-        return MavResult.DENIED
-    _, _, down = point
-    # Param 3 is the climb rate in m/s. 0 selects the maximum.
-    guided.change_altitude(down, abs(command.param3) or _UNLIMITED_M_S)
-    return MavResult.ACCEPTED
-
-
-def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    if not 0.0 <= command.param2 < 360.0:
-        return MavResult.DENIED
-    if command.param1 == HeadingType.DEFAULT:
-        guided.change_course(None)
-    elif command.param1 in (HeadingType.COURSE_OVER_GROUND, HeadingType.HEADING):
-        guided.change_course(math.radians(command.param2))
-    else:
-        return MavResult.DENIED
-    return MavResult.ACCEPTED
-
-
-def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
-    point = plane.world_point(0, 0, command.param1, to_int(command.param2))  # Only the altitude is used.
-    if point is None:
-        return MavResult.DENIED
-    guided = plane.mode_of(PlaneGuided)
-    # Only GUIDED uses the altitude. All modes accept the command.
-    if plane.mode is guided:
+    def _change_altitude(self, command: ReceivedCommand) -> int:
+        point = self.vehicle.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
+        if command.z in _INVALID_ALTITUDES or point is None:
+            return MavResult.DENIED
         _, _, down = point
-        guided.change_altitude(down)
-    return MavResult.ACCEPTED
+        # Param 3 is the climb rate in m/s. 0 selects the maximum.
+        self.change_altitude(down, abs(command.param3) or _UNLIMITED_M_S)
+        return MavResult.ACCEPTED
+
+    def _change_heading(self, command: ReceivedCommand) -> int:
+        if not 0.0 <= command.param2 < 360.0:
+            return MavResult.DENIED
+        if command.param1 == HeadingType.DEFAULT:
+            self._course = None  # The plane circles again.
+        elif command.param1 in (HeadingType.COURSE_OVER_GROUND, HeadingType.HEADING):
+            self._course = math.radians(command.param2)
+        else:
+            return MavResult.DENIED
+        return MavResult.ACCEPTED
+
+    def change_target_altitude(self, command: ReceivedCommand) -> int:
+        """Execute DO_CHANGE_ALTITUDE. All modes accept the command, but only GUIDED uses the altitude."""
+        point = self.vehicle.world_point(0, 0, command.param1, to_int(command.param2))  # Only the altitude is used.
+        if point is None:
+            return MavResult.DENIED
+        if self.is_active:
+            _, _, down = point
+            self.change_altitude(down)
+        return MavResult.ACCEPTED

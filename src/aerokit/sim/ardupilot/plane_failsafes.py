@@ -175,12 +175,12 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             if self._is_in_take_off and not acts_in_take_off:
                 self._is_long_pending = True  # `FS_LONG_ACTN` is executed after the initial climb.
             else:  # Action 0 returns to launch.
-                self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
+                plane.enter_first_accepted(*_LONG_MODES.get(action or _LONG_RTL, ()))
         elif mode == PlaneMode.RTL:  # The plane returns already, so only actions that land change the mode.
             if action in (_LONG_AUTO, _LONG_AUTOLAND):
-                self.change_to(*_LONG_MODES[action])
+                plane.enter_first_accepted(*_LONG_MODES[action])
         elif mode in (PlaneMode.AUTO, PlaneMode.GUIDED) and not plane.mode.is_landing:
-            self.change_to(*_LONG_MODES.get(action, ()))  # Action 0 changes nothing.
+            plane.enter_first_accepted(*_LONG_MODES.get(action, ()))  # Action 0 changes nothing.
         self.warn(f"{'GCS' if state == _GCS else 'RC Long'} Failsafe On: {plane.mode.name}")
 
     @property
@@ -204,7 +204,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             if lands and self._land_by_mission():
                 return
             preferred = (PlaneMode.AUTOLAND,) if action == _AUTOLAND_OR_RTL else ()
-            self.change_to(*preferred, PlaneMode.RTL)
+            self.vehicle.enter_first_accepted(*preferred, PlaneMode.RTL)
 
     def refuse_termination(self) -> None:
         text = "AFS not enabled, can't terminate the vehicle"
@@ -247,7 +247,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     def update(self) -> None:
         super().update()
         if not self.enabled and self.caused_mode and self._mode_before is not None:
-            if self.vehicle.mode.number == PlaneMode.GUIDED and self._action in _RETURNS:
+            if self.vehicle.mode.number == PlaneMode.GUIDED and self.action in _RETURNS:
                 self.vehicle.set_mode(self._mode_before)
             self.caused_mode = False
 
@@ -257,11 +257,11 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             return
         self.report("breached", new_breaches)
         mode_before = plane.mode.number
-        if self._action == _RTL:
+        if self.action == _RTL:
             self._turn_back(mode_before, PlaneMode.RTL)
-        elif self._action == _AUTOLAND and mode_before != PlaneMode.AUTOLAND:  # A running landing continues.
+        elif self.action == _AUTOLAND and mode_before != PlaneMode.AUTOLAND:  # A running landing continues.
             self._turn_back(mode_before, PlaneMode.AUTOLAND, PlaneMode.RTL)
-        elif self._action in (_GUIDED, _GUIDED_THROTTLE):
+        elif self.action in (_GUIDED, _GUIDED_THROTTLE):
             self._turn_back(mode_before, PlaneMode.GUIDED)
             plane.guided.go_to(self.return_place())
 
@@ -293,14 +293,6 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             return None
         return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
 
-    def on_mode_changed(self) -> None:
-        super().on_mode_changed()
-        self.recover_by_hand()
-
-    @property
-    def _action(self) -> int:
-        return int(self.vehicle.parameters["FENCE_ACTION"])
-
     def _turn_back(self, mode_before: int, *modes: int) -> None:
-        self.enter_first_accepted(modes)
+        self.caused_mode: bool = self.vehicle.enter_first_accepted(*modes)
         self._mode_before = mode_before

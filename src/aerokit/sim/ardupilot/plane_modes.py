@@ -269,16 +269,11 @@ class PlaneNavigatingMode(PlaneModeBase):
         super().__init__(plane)
         self.speed: float = 0.0  # Commanded airspeed in m/s; 0 selects AIRSPEED_CRUISE.
         self.radius: float = 0.0  # Radius of the circle in metres; 0 selects WP_LOITER_RAD.
-        self._place: Ned | None = None  # center of the circle, or end of the line, that the plane flies
 
     def enter(self, *, force: bool) -> bool:
         self.speed = self.radius = 0.0
         self._place = self.vehicle.wing.place
         return True
-
-    @property
-    def destination(self) -> Ned | None:
-        return self._place
 
     @property
     def airspeed(self) -> float:

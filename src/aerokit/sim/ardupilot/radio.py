@@ -1,4 +1,4 @@
-"""RC channels of a simulated ArduPilot (transmitter, RC_CHANNELS_OVERRIDE, MANUAL_CONTROL), servos and relays."""
+"""RC channels of a simulated ArduPilot: transmitter, RC_CHANNELS_OVERRIDE and MANUAL_CONTROL."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavResult
 from aerokit.sim.ardupilot.host import (
     RC_PITCH,
     RC_ROLL,
@@ -18,9 +17,7 @@ from aerokit.sim.ardupilot.host import (
     SUB_ROLL,
     ArduPilotHost,
 )
-from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import ReceivedCommand, to_int
 from aerokit.sim.vehicle import sender_of
 
 _AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
@@ -98,7 +95,7 @@ class ArduPilotRadio:
         sender_system, _component = sender_of(override)
         if sender_system != vehicle.parameters["MAV_GCS_SYSID"]:
             return
-        vehicle.failsafes.ground_station_seen_at = vehicle.now
+        vehicle.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
             value = getattr(override, f"chan{index + 1}_raw")
             is_upper = index >= len(self._sticks)  # one of the channels 9 to 16
@@ -129,7 +126,7 @@ class ArduPilotJoystick:
         if sender_system != vehicle.parameters["MAV_GCS_SYSID"] or axes.target != vehicle.system_id:
             return
         vehicle.rc.override(self.sticks(axes))
-        vehicle.failsafes.ground_station_seen_at = vehicle.now
+        vehicle.ground_station_seen_at = vehicle.now
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
         """Return the commanded pulses in microseconds, by channel index. 0 releases a channel."""
@@ -182,68 +179,3 @@ class SubJoystick(ArduPilotJoystick):
         }  # fmt: skip
         pulses = {channel: _CENTER + offset for channel, offset in offsets.items()} | {RC_THROTTLE: throttle}
         return {channel: int(max(_SUB_MIN_PWM, min(_SUB_MAX_PWM, pulse))) for channel, pulse in pulses.items()}
-
-
-_SERVOS = 32
-_RELAYS = {"rover": 2}
-_FUNCTIONS = 320
-_SAVE_WAYPOINT = 7
-# Numbers of the auxiliary functions that each firmware refused in SITL.
-_REFUSED_FUNCTIONS: dict[Kind, tuple[int, ...]] = {
-    "copter": (0,),
-    "plane": (0, _SAVE_WAYPOINT),
-    "rover": (),
-    "sub": (0, _SAVE_WAYPOINT),
-}
-# SERVOn_FUNCTIONs of free outputs: none, and those that pass an RC channel through.
-_FREE_FUNCTIONS = frozenset({0, 1, *range(51, 67)})
-_AUX_POSITIONS = (0.0, 1.0, 2.0)
-
-
-class AuxiliaryOutputs:
-    """Servos, relays and auxiliary switches, set by DO_SET_SERVO, DO_SET_RELAY and DO_AUX_FUNCTION."""
-
-    def __init__(self, vehicle: ArduPilotHost) -> None:
-        self._vehicle = vehicle
-        self.servos: dict[int, int] = {}  # Pulses in microseconds by output number, which counts from 1.
-        self.relays: int = 0  # Bit mask of the relays that are on.
-        self.functions: dict[int, int] = {}  # Switch positions (0 low, 1 middle, 2 high) by auxiliary function.
-
-    @property
-    def relay_count(self) -> int:
-        return _RELAYS.get(self._vehicle.KIND, 1)
-
-    def is_free(self, output: int) -> bool:
-        return self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) in _FREE_FUNCTIONS
-
-    def set_servo(self, command: ReceivedCommand) -> int:
-        output = to_int(command.param1)
-        if not 1 <= output <= _SERVOS:
-            return MavResult.FAILED
-        if not self.is_free(output):
-            self._vehicle.info(f"ServoRelayEvent: Channel {output} is already in use")
-            return MavResult.FAILED
-        self.servos[output] = to_int(command.param2)
-        return MavResult.ACCEPTED
-
-    def set_relay(self, command: ReceivedCommand) -> int:
-        if not 0 <= command.param1 < self.relay_count:
-            return MavResult.FAILED
-        bit = 1 << to_int(command.param1)
-        self.relays = self.relays | bit if command.param2 else self.relays & ~bit
-        return MavResult.ACCEPTED
-
-    def repeat_relay(self, command: ReceivedCommand) -> int:
-        # At the end of the repetitions, the relay has its previous state again.
-        is_valid = 0 <= command.param1 < self.relay_count
-        return MavResult.ACCEPTED if is_valid else MavResult.FAILED
-
-    def switch(self, command: ReceivedCommand) -> int:
-        function = to_int(command.param1)
-        if command.param2 not in _AUX_POSITIONS:
-            return MavResult.DENIED
-        if not 0 <= function < _FUNCTIONS or function in _REFUSED_FUNCTIONS[self._vehicle.KIND]:
-            self._vehicle.info(f"Invalid channel option ({function})")
-            return MavResult.FAILED
-        self.functions[function] = to_int(command.param2)
-        return MavResult.ACCEPTED

@@ -6,19 +6,16 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
-from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import FenceMitigate, MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, RoverMode
-from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors, ConditionTimer
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, RoverJoystick
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverGuided, RoverHost
-from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
-from aerokit.sim.commands import CommandHandler, PositionTarget
-from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
+from aerokit.sim.commands import CommandHandler
+from aerokit.sim.motion import SimulatedWind
 from aerokit.sim.vehicle_motion import GroundLimits, GroundMotion
 
 _NEEDS_LOCATION = 1
@@ -52,15 +49,11 @@ class RoverArming(ArduPilotArming[RoverHost]):
     def on_armed(self) -> None:
         self.vehicle.path.reset()
 
-    def disarm(self, *, force: bool = True) -> bool:
-        rover, was_armed = self.vehicle, self.vehicle.is_armed
-        # A rover disarms even while driving, so `force` has no effect.
-        if not super().disarm(force=True):
-            return False
+    def on_disarmed(self) -> None:
         # The current place becomes home if no command has set home.
-        if was_armed and rover.navigation.home is not None and not rover.navigation.home_is_locked:
+        rover = self.vehicle
+        if rover.navigation.home is not None and not rover.navigation.home_is_locked:
             rover.navigation.set_home(rover.motion.place, lock=False)
-        return True
 
 
 # Values of FS_ACTION, of FENCE_ACTION and of the battery actions.
@@ -128,7 +121,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     def _check_ground_station(self) -> None:
         parameters = self.vehicle.parameters
-        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
+        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.vehicle.ground_station_seen_at):
             return
         self.is_ground_station_lost: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
         self._update_link(_GCS, is_lost=self.is_ground_station_lost)
@@ -169,7 +162,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
         else:
-            self.change_to(*_MODES.get(action, ()))
+            self.vehicle.enter_first_accepted(*_MODES.get(action, ()))
 
     def _check_estimator(self) -> None:
         rover = self.vehicle
@@ -217,61 +210,21 @@ class RoverFence(ArduPilotFence[RoverHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        vehicle = self.vehicle
-        action = int(vehicle.parameters["FENCE_ACTION"])
-        if action == REPORT_ONLY:
+        if self.action == REPORT_ONLY:
             return
         if self.beyond_m(new_breaches) > _HOLD_BEYOND_M:
-            vehicle.set_mode(RoverMode.HOLD)
-        elif action == _TERMINATE:
-            vehicle.arming.disarm()
+            self.vehicle.set_mode(RoverMode.HOLD)
+        elif self.action == _TERMINATE:
+            self.vehicle.arming.disarm()
         else:
-            self.enter_first_accepted(_MODES.get(action, ()))
-
-    def on_mode_changed(self) -> None:
-        super().on_mode_changed()
-        self.recover_by_hand()
-
-
-class RoverSetpoints(GuidedSetpoints):
-    """Handlers of the set-point messages. ArduRover also accepts a heading or a turn rate without a velocity.
-
-    A thrust of 1 means the waypoint speed.
-    """
-
-    vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def refuse_acceleration(self, message: PositionTarget) -> None:
-        self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
-
-    def is_complete(self, target: GuidedTarget) -> bool:
-        # A target without a velocity must have either a heading or a turn rate, but not both.
-        return super().is_complete(target) or (target.yaw is None) != (target.yaw_rate is None)
-
-    def steer(self, message: SetAttitudeTarget) -> None:
-        if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
-            return
-        speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
-        _, _, heading = euler_from_quaternion(*message.q)
-        # The velocity has the direction of the heading. A negative speed is expressed by `backwards`.
-        velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
-        backwards = speed < 0
-        if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:
-            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw=heading)
-        else:
-            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw_rate=message.body_yaw_rate)
-        self.vehicle.guided.set_target(target)
-
-
-_AMPERES_AT_FULL = 16.0
+            self.caused_mode: bool = self.vehicle.enter_first_accepted(*_MODES.get(self.action, ()))
 
 
 class RoverMotors(ArduPilotMotors):
     """The motor that drives the wheels."""
 
-    @property
-    def current_a(self) -> float:
-        return abs(self.throttle) * _AMPERES_AT_FULL
+    ELECTRONICS_A: ClassVar[float] = 0.0
+    AMPERES_AT_FULL: ClassVar[float] = 16.0
 
     def update(self, dt: float, *, landed: bool) -> None:
         motion = self.vehicle.motion
@@ -293,6 +246,8 @@ class SimulatedRover(RoverHost):
     Not simulated: boats, driving in circles, braking before a fence.
     """
 
+    guided: RoverGuided  # pyright: ignore[reportIncompatibleVariableOverride]
+
     KIND: ClassVar[Kind] = "rover"
     FIRMWARE: ClassVar[str] = "ArduRover"
     MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
@@ -308,7 +263,6 @@ class SimulatedRover(RoverHost):
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = RoverFence
     MOTORS: ClassVar[type[ArduPilotMotors]] = RoverMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = RoverJoystick
-    SETPOINTS: ClassVar[type[Any]] = RoverSetpoints
 
     def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
         """Create the motion model with limits from the parameters. Wind is reported, but does not move the rover."""
@@ -328,20 +282,9 @@ class SimulatedRover(RoverHost):
         return self.mode.number == RoverMode.HOLD
 
     @property
-    def guided(self) -> RoverGuided:
-        return self.mode_of(RoverGuided)
-
-    @property
     def base_mode(self) -> int:
         manual_input = MavModeFlag.MANUAL_INPUT_ENABLED if self.mode.name in _MANUAL_INPUT else 0
         return super().base_mode | manual_input
-
-    @property
-    def is_at_rest(self) -> bool:
-        return abs(self.motion.speed_m_s) < 0.01
-
-    def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
-        return "Flight mode change failed"
 
     def make_commands(self) -> dict[int, CommandHandler]:
         return {

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavSeverity, RoverMode
-from aerokit.mavlink.messages import MissionItemReached
+from aerokit.mavlink.messages import MissionItemReached, SetAttitudeTarget
 from aerokit.sim.ardupilot.host import RC_ROLL, RC_THROTTLE, ArduPilotMode, variant
-from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
+from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, GuidedTargetMode, RoverSubAuto, RoverSubVehicle
-from aerokit.sim.motion import Ned, wrap_pi
+from aerokit.sim.commands import PositionTarget
+from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 from aerokit.sim.vehicle_motion import GroundMotion
 
 _ARRIVED_M, _STANDING_M_S = 0.3, 0.1
@@ -24,11 +26,6 @@ class RoverHost(RoverSubVehicle):
 
     def reset_controllers(self) -> None:
         self.rc[RC_THROTTLE] = 1500
-        self.path: SmartPath = SmartPath(self, only_armed=False)
-
-    def _become_ready(self) -> None:
-        super()._become_ready()
-        self.path.start()
 
     @property
     def top_speed(self) -> float:
@@ -143,12 +140,6 @@ class RoverAuto(RoverSubAuto):
 
     vehicle: RoverHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def default_speed(self) -> float:
-        return self.vehicle.waypoint_speed
-
-    def refuse(self) -> None:
-        self.vehicle.send_text(MavSeverity.NOTICE, "No Mission. Can't set AUTO.")
-
     def travel(self, place: Ned, *, stops: bool) -> None:
         if stops and self.has_arrived(place):
             self.vehicle.motion.stop()
@@ -158,20 +149,16 @@ class RoverAuto(RoverSubAuto):
     def has_arrived(self, place: Ned) -> bool:
         return self.vehicle.has_arrived(place) if self._stops else self.vehicle.has_passed(place)
 
-    def stay(self) -> None:
-        self.vehicle.motion.stop()
-
     def reached_text(self, index: int, seconds: float) -> str:
         text = f"Reached waypoint #{index}"
         return f"{text}. Loiter for {seconds:.0f} seconds" if seconds > 0 else text
 
-    def finish(self) -> None:
-        # The rover stops here, because only MIS_DONE_BEHAVE 0 (hold) is simulated.
-        self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
-
 
 class RoverGuided(GuidedTargetMode):
-    """GUIDED: drives to a place, or for up to three seconds with a velocity and a turn rate."""
+    """GUIDED: drives to a place, or for up to three seconds with a velocity and a turn rate.
+
+    ArduRover also accepts a heading or a turn rate without a velocity. A thrust of 1 means the waypoint speed.
+    """
 
     number: int = RoverMode.GUIDED
     name = "GUID"
@@ -228,6 +215,27 @@ class RoverGuided(GuidedTargetMode):
             # When the rover drives backwards, its nose points away from the direction of travel.
             heading = math.atan2(east, north) + (math.pi if target.backwards else 0.0)
             motion.head(speed, heading if target.yaw is None else target.yaw)
+
+    def refuse_acceleration(self, message: PositionTarget) -> None:
+        self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
+
+    def accepts(self, target: GuidedTarget) -> bool:
+        # A target without a velocity must have either a heading or a turn rate, but not both.
+        return super().accepts(target) or (target.yaw is None) != (target.yaw_rate is None)
+
+    def steer(self, message: SetAttitudeTarget) -> None:
+        if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
+            return
+        speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
+        _, _, heading = euler_from_quaternion(*message.q)
+        # The velocity has the direction of the heading. A negative speed is expressed by `backwards`.
+        velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
+        backwards = speed < 0
+        if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:
+            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw=heading)
+        else:
+            target = GuidedTarget(velocity=velocity, backwards=backwards, yaw_rate=message.body_yaw_rate)
+        self.set_target(target)
 
 
 ROVER_MODES: tuple[Callable[[RoverHost], ArduPilotMode], ...] = (

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd as Cmd
-from aerokit.mavlink.enums import MavFrame, MavResult, SpeedType
+from aerokit.mavlink.enums import MavFrame, MavResult, MavSeverity, SpeedType
 from aerokit.mavlink.messages import (
     MissionItemReached,
     SetAttitudeTarget,
@@ -17,12 +16,13 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.host import ArduPilotMode
-from aerokit.sim.ardupilot.mission_run import MissionMode, place_of, set_home_from
+from aerokit.sim.ardupilot.host import GuidedMode
+from aerokit.sim.ardupilot.mission_run import MissionMode, SupportedCommand, place_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, PositionTarget, ReceivedCommand, Setpoint, is_finite, rotated
 from aerokit.sim.motion import Ned
+from aerokit.sim.vehicle_motion import GroundMotion, UnderwaterMotion
 
 _BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
 _FIXED = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED})
@@ -42,19 +42,24 @@ class GuidedTarget:
     """Seconds after which a target without a position expires."""
 
 
-class GuidedTargetMode(ArduPilotMode):
-    """Base of the guided modes: goes to a place, or follows a target without a place until the target expires."""
+class GuidedTargetMode(GuidedMode):
+    """Base of the guided modes: goes to a place, or follows a target without a place until the target expires.
+
+    Invalid set-points are ignored. A subclass selects what a firmware supports.
+    """
+
+    BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
+    """MAV_FRAMEs whose vectors are relative to the heading."""
+    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = _BODY
+    """MAV_FRAMEs whose yaw is relative to the heading."""
+    GLOBAL_YAW: ClassVar[bool] = True
+    """True if the firmware uses the yaw and the turn rate of SET_POSITION_TARGET_GLOBAL_INT."""
 
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
         self.speed: float = 0.0
-        self._place: Ned | None = None  # place to go to; None while the vehicle follows `_target`
-        self._target: GuidedTarget | None = None  # None if the vehicle must stop
+        self._target: GuidedTarget | None = None  # followed while there is no `_place`; None to stop
         self._target_at = 0.0
-
-    @property
-    def destination(self) -> Ned | None:
-        return self._place
 
     def go_to(self, position: Ned) -> None:
         self._place = position
@@ -68,54 +73,33 @@ class GuidedTargetMode(ArduPilotMode):
             self._target = target
             self._target_at = self.vehicle.now
 
-
-class GuidedSetpoints:
-    """Handlers of the set-point messages. Invalid messages are ignored. A subclass selects what a firmware supports."""
-
-    BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
-    """MAV_FRAMEs whose vectors are relative to the heading."""
-    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = _BODY
-    """MAV_FRAMEs whose yaw is relative to the heading."""
-    GLOBAL_YAW: ClassVar[bool] = True
-    """True if the firmware uses the yaw and the turn rate of SET_POSITION_TARGET_GLOBAL_INT."""
-
-    def __init__(self, vehicle: RoverSubVehicle) -> None:
-        self.vehicle: RoverSubVehicle = vehicle
-        vehicle.on(SetPositionTargetLocalNed, self._on_local)
-        vehicle.on(SetPositionTargetGlobalInt, self._on_global)
-        vehicle.on(SetAttitudeTarget, self._on_attitude)
-
     def refuse_acceleration(self, message: PositionTarget) -> None: ...
 
     def steer(self, message: SetAttitudeTarget) -> None:
         raise NotImplementedError
 
-    def is_complete(self, target: GuidedTarget) -> bool:
+    def accepts(self, target: GuidedTarget) -> bool:
         """Return True if the firmware accepts this combination of values."""
         return target.position is not None or target.velocity is not None
 
-    @property
-    def _is_guided(self) -> bool:
-        return self.vehicle.mode is self.vehicle.guided
-
-    def _on_attitude(self, message: SetAttitudeTarget, _: Channel) -> None:
-        if self._is_guided and all(map(math.isfinite, (*message.q, message.thrust, message.body_yaw_rate))):
+    def on_attitude_target(self, message: SetAttitudeTarget, _: Channel) -> None:
+        if self.is_active and all(map(math.isfinite, (*message.q, message.thrust, message.body_yaw_rate))):
             self.steer(message)
 
-    def _on_local(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
+    def on_local_target(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
         if message.coordinate_frame in _FIXED | self.BODY_FRAMES:
-            self._follow(message, self.vehicle.local_point(message, self.BODY_FRAMES), uses_yaw=True)
+            self._set_target_from(message, self.vehicle.local_point(message, self.BODY_FRAMES), uses_yaw=True)
 
-    def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
+    def on_global_target(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
         frame = message.coordinate_frame
         point = self.vehicle.world_point(message.lat_int, message.lon_int, message.alt, frame)
         if point is not None or not Setpoint.of(message).has_position:
-            self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
+            self._set_target_from(message, point, uses_yaw=self.GLOBAL_YAW)
 
-    def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
+    def _set_target_from(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
         """Follow a set-point in GUIDED. ``point`` is its position in the world frame."""
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
-        if not self._is_guided:
+        if not self.is_active:
             return
         if setpoint.has_acceleration:
             self.refuse_acceleration(message)
@@ -135,19 +119,18 @@ class GuidedSetpoints:
         if velocity is not None and frame in self.BODY_FRAMES:
             velocity = rotated(velocity, self.vehicle.motion.yaw)
         target = GuidedTarget(position, velocity, backwards=backwards, yaw=yaw, yaw_rate=yaw_rate)
-        if self.is_complete(target):
-            self.vehicle.guided.set_target(target)
+        if self.accepts(target):
+            self.set_target(target)
 
 
 class RoverSubVehicle(ArduPilotVehicle):
     """Base of Rover and Sub. Takes the arguments of `ArduPilotVehicle`."""
 
-    @property
-    def guided(self) -> GuidedTargetMode:
-        raise NotImplementedError
+    motion: GroundMotion | UnderwaterMotion  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property
-    def is_at_rest(self) -> bool:
+    def waypoint_speed(self) -> float:
+        """Speed between waypoints in m/s, which parameters define."""
         raise NotImplementedError
 
     @property
@@ -169,7 +152,7 @@ class RoverSubVehicle(ArduPilotVehicle):
         self.motors.update(dt, landed=False)  # Rovers and submarines do not land.
         self.move(dt)
         self.battery.drain(self.motors.current_a, dt)
-        if not self.motors.is_armed and self.is_at_rest:
+        if not self.motors.is_armed and self.motion.is_still:
             self.set_ticking(False)
 
     def make_commands(self) -> dict[int, CommandHandler]:
@@ -188,10 +171,7 @@ class RoverSubVehicle(ArduPilotVehicle):
 
 _WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME})
 
-_WITHOUT_EFFECT = (
-    Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_FENCE_ENABLE, Cmd.DO_GUIDED_LIMITS,
-    Cmd.CONDITION_DISTANCE,
-)  # fmt: skip
+_WITHOUT_EFFECT = (Cmd.DO_SET_ROI, Cmd.DO_SET_ROI_LOCATION, Cmd.DO_SET_ROI_NONE, Cmd.DO_GUIDED_LIMITS)
 
 
 class RoverSubAuto(MissionMode):
@@ -201,24 +181,26 @@ class RoverSubAuto(MissionMode):
 
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
-        self._place: Ned | None = None  # place of the current command; None if the vehicle stays
         self._stops = True  # True if the vehicle stops at `_place`
         self._reached_at: float | None = None  # time of arrival at `_place`; None before
         self._wait_until = 0.0  # end of a delay command
-        self.handlers: dict[int, Callable[[MissionItem], None]] = {
-            **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_RETURN_TO_LAUNCH), self._go),
-            **dict.fromkeys((Cmd.NAV_DELAY, Cmd.CONDITION_DELAY), self._wait),
-            Cmd.DO_CHANGE_SPEED: self._change_speed,
-            Cmd.DO_SET_HOME: lambda item: set_home_from(vehicle, item),
-            **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
-        }
-
-    def default_speed(self) -> float:
-        """Return the speed in m/s that the parameters define."""
-        raise NotImplementedError
-
-    def refuse(self) -> None:
-        """Report that there is no mission."""
+        self.commands.update(
+            {
+                **dict.fromkeys(_WAYPOINTS, SupportedCommand(self._go, self._has_stayed)),
+                Cmd.NAV_RETURN_TO_LAUNCH: SupportedCommand(
+                    self._go, lambda *_: self._place is None or self.has_arrived(self._place)
+                ),
+                **dict.fromkeys(
+                    (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY),
+                    SupportedCommand(self._wait, lambda *_: vehicle.now >= self._wait_until),
+                ),
+                Cmd.CONDITION_DISTANCE: SupportedCommand(
+                    is_done=lambda _, item: self.distance_to_destination < item.param1
+                ),
+                Cmd.DO_CHANGE_SPEED: SupportedCommand(self._change_speed),
+                **dict.fromkeys(_WITHOUT_EFFECT, SupportedCommand()),
+            }
+        )
 
     def travel(self, place: Ned, *, stops: bool) -> None:
         raise NotImplementedError
@@ -226,25 +208,17 @@ class RoverSubAuto(MissionMode):
     def has_arrived(self, place: Ned) -> bool:
         raise NotImplementedError
 
-    def stay(self) -> None:
-        raise NotImplementedError
-
     def reached_text(self, index: int, seconds: float) -> str:
         raise NotImplementedError
-
-    def finish(self) -> None: ...
-
-    @property
-    def destination(self) -> Ned | None:
-        return self._place
 
     def enter(self, *, force: bool) -> bool:
         if self.vehicle.mode is self:  # Arming enters the current mode again, which must not restart the mission.
             return True
         if not self.vehicle.mission.is_present:
-            self.refuse()
+            if self.vehicle.KIND == "rover":
+                self.vehicle.send_text(MavSeverity.NOTICE, "No Mission. Can't set AUTO.")
             return False
-        self.speed = self.default_speed()
+        self.speed = self.vehicle.waypoint_speed
         self._place = None
         self.wait_for_origin()
         return True
@@ -256,7 +230,7 @@ class RoverSubAuto(MissionMode):
         if self.vehicle.mode is not self:  # The mission has changed the mode.
             return
         if self._place is None:
-            self.stay()
+            self.vehicle.motion.stop()
         else:
             self.travel(self._place, stops=self._stops)
 
@@ -268,21 +242,8 @@ class RoverSubAuto(MissionMode):
 
     def end_mission(self) -> None:
         self._place = None
-        self.finish()
-
-    def _is_done(self, index: int, item: MissionItem) -> bool:
-        command, now = item.command, self.vehicle.now
-        if command in _WAYPOINTS:
-            # NAV_LOITER_UNLIM never ends, but its arrival is reported.
-            return self._has_stayed(index, item) and command != Cmd.NAV_LOITER_UNLIM
-        if command == Cmd.NAV_RETURN_TO_LAUNCH:
-            return self._place is None or self.has_arrived(self._place)
-        if command in (Cmd.NAV_DELAY, Cmd.CONDITION_DELAY):
-            return now >= self._wait_until
-        if command == Cmd.CONDITION_DISTANCE:
-            return self.distance_to_destination < item.param1
-        self.warn_if_unknown(item)
-        return True
+        if self.vehicle.KIND == "rover":  # The rover stops, because only MIS_DONE_BEHAVE 0 (hold) is simulated.
+            self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
 
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
         if self._place is None:
@@ -294,7 +255,8 @@ class RoverSubAuto(MissionMode):
             self._reached_at = now
             self.vehicle.info(self.reached_text(index, item.param1))
         delay_s = max(0.0, item.param1)
-        return now - self._reached_at >= delay_s
+        # NAV_LOITER_UNLIM never ends, but its arrival is reported.
+        return now - self._reached_at >= delay_s and item.command != Cmd.NAV_LOITER_UNLIM
 
     def _go(self, item: MissionItem) -> None:
         vehicle = self.vehicle

@@ -7,20 +7,17 @@ from collections.abc import Callable
 from itertools import cycle
 from typing import Any, ClassVar
 
-from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity, MavType, SpeedType, SubMode
-from aerokit.mavlink.messages import SetAttitudeTarget
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, SpeedType, SubMode
 from aerokit.sim.ardupilot.commands import commanded_heading
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ArduPilotMotors
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.radio import ArduPilotJoystick, SubJoystick
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
-from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
 from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided, SubHost
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import CommandHandler, ReceivedCommand
-from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
+from aerokit.sim.motion import SimulatedWind
 from aerokit.sim.vehicle_motion import UnderwaterMotion
 
 _BUTTONS = range(16)
@@ -39,9 +36,6 @@ class SubArming(ArduPilotArming[SubHost]):
         if self.vehicle.is_initialised and not self._has_disarm_button():
             return ["Must assign a disarm or arm_toggle button or disarm aux function"]
         return super().reasons()
-
-    def disarm(self, *, force: bool = True) -> bool:
-        return super().disarm(force=True)
 
     def _has_disarm_button(self) -> bool:
         parameters = self.vehicle.parameters
@@ -128,7 +122,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     def _check_ground_station(self) -> None:
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_GCS_ENABLE"])
-        if not action or math.isnan(self.ground_station_seen_at):
+        if not action or math.isnan(self.vehicle.ground_station_seen_at):
             return
         if self.ground_station_silence < sub.parameters["FS_GCS_TIMEOUT"]:
             if self.is_ground_station_lost:
@@ -192,26 +186,6 @@ class _HullLimit:
             sub.send_text(MavSeverity.WARNING, f"Internal {self._quantity} critical!")
 
 
-class SubSetpoints(GuidedSetpoints):
-    """Handlers of the set-point messages. Yaw is relative to the heading only in BODY_OFFSET_NED.
-
-    In SET_ATTITUDE_TARGET, thrust sets a climb rate (0.5 holds the depth). Roll and pitch have no effect.
-    """
-
-    BODY_FRAMES: ClassVar[frozenset[int]] = GuidedSetpoints.BODY_FRAMES | {MavFrame.BODY_FRD}
-    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = frozenset({MavFrame.BODY_OFFSET_NED})
-    GLOBAL_YAW: ClassVar[bool] = False
-
-    def steer(self, message: SetAttitudeTarget) -> None:
-        if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
-            return
-        climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)  # A thrust of 0.5 holds the depth.
-        max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
-        climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
-        _, _, yaw = euler_from_quaternion(*message.q)
-        self.vehicle.guided.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
-
-
 _HOLDING_THROTTLE, _THROTTLE_PER_CLIMB_M_S = 0.45, 0.44
 _AMPERES_AT_FULL = 26.3
 
@@ -246,6 +220,8 @@ class SimulatedSub(SubHost):
     the surface.
     """
 
+    guided: SubGuided  # pyright: ignore[reportIncompatibleVariableOverride]
+
     KIND: ClassVar[Kind] = "sub"
     FIRMWARE: ClassVar[str] = "ArduSub"
     MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
@@ -258,7 +234,6 @@ class SimulatedSub(SubHost):
     FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]] = SubFailsafes
     MOTORS: ClassVar[type[ArduPilotMotors]] = SubMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = SubJoystick
-    SETPOINTS: ClassVar[type[Any]] = SubSetpoints
 
     def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
         """Create the motion model. Each unit of SIM_BUOYANCY accelerates upwards by 0.1 m/s². Wind has no effect."""
@@ -276,14 +251,6 @@ class SimulatedSub(SubHost):
     @property
     def is_standby(self) -> bool:
         return not self.motors.is_armed
-
-    @property
-    def guided(self) -> SubGuided:
-        return self.mode_of(SubGuided)
-
-    @property
-    def is_at_rest(self) -> bool:
-        return self.motion.is_still
 
     def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         if reason == "requires position":

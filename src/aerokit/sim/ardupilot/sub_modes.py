@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import cycle
+from typing import ClassVar
 
-from aerokit.mavlink.enums import SubMode
+from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
+from aerokit.mavlink.enums import MavFrame, SubMode
+from aerokit.mavlink.messages import SetAttitudeTarget
 from aerokit.sim.ardupilot.host import RC_THROTTLE, RC_YAW, SUB_FORWARD, SUB_LATERAL, ArduPilotMode, variant
 from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, GuidedTargetMode, RoverSubAuto, RoverSubVehicle
 from aerokit.sim.commands import rotated
-from aerokit.sim.motion import Ned, wrap_pi
+from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 from aerokit.sim.vehicle_motion import UnderwaterMotion
 
 _MIN_LOOK_AHEAD_M, _MIN_TRAVEL_M_S = 1.0, 0.05
@@ -27,6 +30,10 @@ class SubHost(RoverSubVehicle):
     motion: UnderwaterMotion  # pyright: ignore[reportIncompatibleVariableOverride]
     hull_pressure_pa: float = 101_325.0
     hull_temperature_c: float = 28.0
+
+    @property
+    def waypoint_speed(self) -> float:
+        return self.parameters["WPNAV_SPEED"] / 100.0
 
     @property
     def is_at_surface(self) -> bool:
@@ -132,24 +139,26 @@ class SubAuto(RoverSubAuto):
 
     vehicle: SubHost  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def default_speed(self) -> float:
-        return self.vehicle.parameters["WPNAV_SPEED"] / 100.0
-
     def travel(self, place: Ned, *, stops: bool) -> None:
         self.vehicle.travel(place, self.speed)
 
     def has_arrived(self, place: Ned) -> bool:
         return self.vehicle.distance(place) <= self.vehicle.parameters["WPNAV_RADIUS"] / 100.0
 
-    def stay(self) -> None:
-        self.vehicle.motion.seek_velocity(0.0, 0.0, 0.0)
-
     def reached_text(self, index: int, seconds: float) -> str:
         return f"Reached command #{index}"
 
 
 class SubGuided(GuidedTargetMode):
-    """GUIDED: moves to a place, or for up to three seconds with a velocity. Without a target it stops."""
+    """GUIDED: moves to a place, or for up to three seconds with a velocity. Without a target it stops.
+
+    In SET_ATTITUDE_TARGET, thrust sets a climb rate (0.5 holds the depth). Roll and pitch have no effect. Yaw is
+    relative to the heading only in BODY_OFFSET_NED.
+    """
+
+    BODY_FRAMES: ClassVar[frozenset[int]] = GuidedTargetMode.BODY_FRAMES | {MavFrame.BODY_FRD}
+    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = frozenset({MavFrame.BODY_OFFSET_NED})
+    GLOBAL_YAW: ClassVar[bool] = False
 
     number: int = SubMode.GUIDED
     name = "GUIDED"
@@ -159,7 +168,7 @@ class SubGuided(GuidedTargetMode):
 
     def enter(self, *, force: bool) -> bool:
         self._place = self._target = self._heading = None
-        self.speed: float = self.vehicle.parameters["WPNAV_SPEED"] / 100.0
+        self.speed: float = self.vehicle.waypoint_speed
         return True
 
     def go_to(self, position: Ned) -> None:
@@ -187,13 +196,22 @@ class SubGuided(GuidedTargetMode):
         elif target is not None and target.velocity is not None:
             motion.seek_velocity(*target.velocity)
         else:
-            motion.seek_velocity(0.0, 0.0, 0.0)
+            motion.stop()
         if self._heading is not None:
             motion.face(self._heading)
         elif target is not None and target.yaw_rate is not None:
             motion.turn(target.yaw_rate)
         else:
             motion.turn(0.0)  # Hold the heading.
+
+    def steer(self, message: SetAttitudeTarget) -> None:
+        if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
+            return
+        climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)  # A thrust of 0.5 holds the depth.
+        max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
+        climb = climb_share * self.vehicle.parameters[max_climb_parameter] / 100.0
+        _, _, yaw = euler_from_quaternion(*message.q)
+        self.set_target(GuidedTarget(velocity=(0.0, 0.0, -climb), yaw=yaw, timeout_s=1.0))
 
 
 SUB_MODES: tuple[Callable[[SubHost], ArduPilotMode], ...] = (

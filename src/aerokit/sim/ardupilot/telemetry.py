@@ -342,7 +342,7 @@ def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
 
 def _servo_outputs(vehicle: ArduPilotVehicle, *pulses: int) -> m.ServoOutputRaw:
     outputs = [*pulses, *(0,) * (_OUTPUTS - len(pulses))]
-    for number, pulse in vehicle.accessories.servos.items():
+    for number, pulse in vehicle.devices.servos.items():
         if 1 <= number <= _OUTPUTS:
             outputs[number - 1] = pulse
     return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, *outputs)
@@ -371,18 +371,18 @@ _ALL: Builders = {
     m.EscTelemetry1To4.ID: _esc_telemetry,
     m.AutopilotVersion.ID: _autopilot_version,
     m.RelayStatus.ID: lambda vehicle: m.RelayStatus(
-        vehicle.time_boot_ms, vehicle.accessories.relays, (1 << vehicle.accessories.relay_count) - 1
+        vehicle.time_boot_ms, vehicle.devices.relays, (1 << vehicle.devices.relay_count) - 1
     ),
     m.FlightInformation.ID: lambda vehicle: m.FlightInformation(
         vehicle.time_boot_ms, arming_time_utc=0, takeoff_time_utc=0, flight_uuid=0
     ),
-    m.GimbalDeviceAttitudeStatus.ID: lambda vehicle: vehicle.gimbal.attitude_status(),
-    m.GimbalManagerInformation.ID: lambda vehicle: vehicle.gimbal.manager_information(),
-    m.GimbalManagerStatus.ID: lambda vehicle: vehicle.gimbal.manager_status(),
-    m.CameraInformation.ID: lambda vehicle: vehicle.camera.information(),
-    m.CameraSettings.ID: lambda vehicle: vehicle.camera.settings(),
-    m.CameraCaptureStatus.ID: lambda vehicle: vehicle.camera.capture_status(),
-    m.CameraFeedback.ID: lambda vehicle: vehicle.camera.last_feedback(),
+    m.GimbalDeviceAttitudeStatus.ID: lambda v: v.gimbal.attitude_status() if v.gimbal.is_fitted else None,
+    m.GimbalManagerInformation.ID: lambda v: v.gimbal.manager_information() if v.gimbal.is_fitted else None,
+    m.GimbalManagerStatus.ID: lambda v: v.gimbal.manager_status() if v.gimbal.is_fitted else None,
+    m.CameraInformation.ID: lambda v: v.camera.information() if v.camera.is_fitted else None,
+    m.CameraSettings.ID: lambda v: v.camera.settings() if v.camera.is_fitted else None,
+    m.CameraCaptureStatus.ID: lambda v: v.camera.capture_status() if v.camera.is_fitted else None,
+    m.CameraFeedback.ID: lambda v: v.camera.feedback if v.camera.is_fitted else None,
     m.FenceStatus.ID: lambda vehicle: vehicle.fence.status(),
     m.MagCalProgress.ID: lambda vehicle: vehicle.calibrations.compasses.progress(),
     m.MagCalReport.ID: lambda vehicle: vehicle.calibrations.compasses.report(),

@@ -18,9 +18,10 @@ from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.copter_guided import CopterGuided
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-from aerokit.sim.motion import GRAVITY_M_S2, centidegrees, quaternion_from_euler
+from aerokit.sim.motion import GRAVITY_M_S2, GlobalPoint, centidegrees, quaternion_from_euler
 
 Three = tuple[int, int, int]
+_UNKNOWN_PLACE = GlobalPoint(0, 0, 0.0)  # As in the firmware, position fields are 0 before the first position.
 
 
 def _attitude_quaternion(vehicle: ArduPilotVehicle) -> m.AttitudeQuaternion | None:
@@ -47,9 +48,7 @@ def _ahrs(vehicle: ArduPilotVehicle) -> m.Ahrs:
 
 
 def _ahrs2(vehicle: ArduPilotVehicle) -> m.Ahrs2:
-    place = vehicle.navigation.position
-    if place is None:
-        return m.Ahrs2(*vehicle.motion.angles, altitude=0.0, lat=0, lng=0)
+    place = vehicle.navigation.position or _UNKNOWN_PLACE
     return m.Ahrs2(*vehicle.motion.angles, place.altitude_m, place.latitude_e7, place.longitude_e7)
 
 
@@ -62,14 +61,14 @@ def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
 
 
 def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
-    motion, place = vehicle.motion, vehicle.navigation.position
+    motion, place = vehicle.motion, vehicle.navigation.position or _UNKNOWN_PLACE
     # ArduRover sends no airspeed and no climb rate. Its throttle is positive even in reverse.
     is_rover = vehicle.KIND == "rover"
     has_airspeed = vehicle.navigation.has_position and not is_rover
     return m.VfrHud(
         airspeed=motion.airspeed_m_s if has_airspeed else 0.0, groundspeed=motion.ground_speed_m_s,
         heading=int(math.degrees(motion.yaw) % 360.0), throttle=round(abs(vehicle.motors.throttle) * 100),
-        alt=0.0 if place is None else place.altitude_m, climb=0.0 if is_rover else -motion.velocity_down,
+        alt=place.altitude_m, climb=0.0 if is_rover else -motion.velocity_down,
     )  # fmt: skip
 
 
@@ -144,19 +143,15 @@ _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which th
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     motion, nav = vehicle.motion, vehicle.navigation
-    time = vehicle.time_boot_ms
-    place = nav.position
+    place = nav.position or _UNKNOWN_PLACE
     relative = round(nav.altitude_above_home * 1000)
     heading = centidegrees(motion.yaw) if nav.has_attitude else 0
-    if place is None:  # As in the firmware, latitude and longitude are 0 before the first position.
-        return m.GlobalPositionInt(
-            time_boot_ms=time, lat=0, lon=0, alt=0, relative_alt=relative, vx=0, vy=0, vz=0, hdg=heading
-        )
     altitude = round(place.altitude_m * 1000)
-    north, east, down = (round(speed * 100) for speed in motion.velocity)
+    is_known = place is not _UNKNOWN_PLACE
+    north, east, down = (round(speed * 100) if is_known else 0 for speed in motion.velocity)
     return m.GlobalPositionInt(
-        time, lat=place.latitude_e7, lon=place.longitude_e7, alt=altitude, relative_alt=relative, vx=north, vy=east,
-        vz=down, hdg=heading,
+        vehicle.time_boot_ms, lat=place.latitude_e7, lon=place.longitude_e7, alt=altitude, relative_alt=relative,
+        vx=north, vy=east, vz=down, hdg=heading,
     )  # fmt: skip
 
 

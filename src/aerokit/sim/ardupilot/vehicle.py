@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
@@ -20,12 +20,12 @@ from aerokit.sim.ardupilot.external import ArduPilotExternal
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
-from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode, ArduPilotMotors
+from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode, ArduPilotMotors, GuidedMode
 from aerokit.sim.ardupilot.kinds import BOOT_TIMELINES, BootTimeline, parameters_of
 from aerokit.sim.ardupilot.mission_run import MissionMode, MissionRun
 from aerokit.sim.ardupilot.mission_server import ArduPilotMissionServer
-from aerokit.sim.ardupilot.navigation import ArduPilotNavigation
-from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio, AuxiliaryOutputs
+from aerokit.sim.ardupilot.navigation import ArduPilotNavigation, SmartPath
+from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio
 from aerokit.sim.ardupilot.requests import ArduPilotMessageRequests
 from aerokit.sim.ardupilot.storage import ArduPilotSigning, ArduPilotStorage
 from aerokit.sim.autopilot import SimulatedBattery, VehicleStorage
@@ -39,7 +39,6 @@ from aerokit.sim.vehicle import AttachableComponent, sender_of
 _TIMESYNC_INTERVAL_S = 10.0
 _STICK_MIDDLE, _STICK_RANGE = 1500, 500
 _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
-ModeT = TypeVar("ModeT", bound="ArduPilotMode")
 
 
 class ArduPilotVehicle(ArduPilotHost):
@@ -75,8 +74,6 @@ class ArduPilotVehicle(ArduPilotHost):
     MOTORS: ClassVar[type[ArduPilotMotors]] = ArduPilotMotors
     JOYSTICK: ClassVar[type[ArduPilotJoystick]] = ArduPilotJoystick
     """Receiver of MANUAL_CONTROL."""
-    SETPOINTS: ClassVar[type[Any]]
-    """Handlers of set-point messages."""
 
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
     """True if home cannot be set before the estimator has an origin."""
@@ -130,7 +127,6 @@ class ArduPilotVehicle(ArduPilotHost):
         self.rc: ArduPilotRadio = ArduPilotRadio(self)  # RC channels. The throttle stick (index 2) rests at 1000.
         self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
-        self._stream_groups = stream_groups
         latitude, longitude, altitude_m = home
         self.frame: LocalFrame = LocalFrame(GlobalPoint(round(latitude * 1e7), round(longitude * 1e7), altitude_m))
         self.external: ArduPilotExternal = ArduPilotExternal(self)
@@ -138,7 +134,11 @@ class ArduPilotVehicle(ArduPilotHost):
         self.missions: ArduPilotMissionServer = ArduPilotMissionServer(self)
         """Mission, fence and rally points, which survive a reboot."""
         self._reset()
-        self._listen()
+        self.requests: ArduPilotMessageRequests = ArduPilotMessageRequests(self, stream_groups=stream_groups)
+        self.serve_commands(self.make_commands())
+        self.on(m.Heartbeat, self._on_heartbeat)
+        self.on(m.SetMode, self._on_set_mode)
+        self.JOYSTICK(self)
         self.storage: VehicleStorage = ArduPilotStorage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
@@ -150,9 +150,10 @@ class ArduPilotVehicle(ArduPilotHost):
         self.is_landed: bool = self.motion.is_on_ground
         self.motors: ArduPilotMotors = self.MOTORS(self)
         self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.external)
+        self.path: SmartPath = SmartPath(self)  # Only ArduCopter and ArduRover record it.
+        self.ground_station_seen_at: float = math.nan
         self.failsafes: ArduPilotFailsafes[Any] = self.FAILSAFES(self)
         self.arming: ArduPilotArming[Any] = self.ARMING(self, self.failsafes, self.calibrations.compasses)
-        self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
         self.devices: ArduPilotDevices = ArduPilotDevices(self, self.arming)
         self.fence: ArduPilotFence[Any] = self.FENCE(self)
         self.gimbal: ArduPilotGimbal = ArduPilotGimbal(self)
@@ -162,23 +163,18 @@ class ArduPilotVehicle(ArduPilotHost):
         self.rc.release_overrides()
         modes = [make_mode(self) for make_mode in self.MODES]
         self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in modes}
+        self.auto: MissionMode = next(mode for mode in modes if isinstance(mode, MissionMode))
+        self.guided: GuidedMode = next(mode for mode in modes if isinstance(mode, GuidedMode))
+        self.on(m.SetPositionTargetLocalNed, self.guided.on_local_target)
+        self.on(m.SetPositionTargetGlobalInt, self.guided.on_global_target)
+        self.on(m.SetAttitudeTarget, self.guided.on_attitude_target)
         self.reset_controllers()
-        self.mission: MissionRun = MissionRun(
-            self, self.auto, self.camera
-        )  # executes the mission that `missions` stores
+        self.mission: MissionRun = MissionRun(self, self.auto, self.camera)
         self.missions.reset()
         self.mode: ArduPilotMode = self._modes[self.first_mode]
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> ArduPilotSigning:
         return ArduPilotSigning(self, key, timestamp)
-
-    def _listen(self) -> None:
-        self.requests: ArduPilotMessageRequests = ArduPilotMessageRequests(self, stream_groups=self._stream_groups)
-        self.serve_commands(self.make_commands())
-        self.SETPOINTS(self)
-        self.on(m.Heartbeat, self._on_heartbeat)
-        self.on(m.SetMode, self._on_set_mode)
-        self.JOYSTICK(self)
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         """Create the motion model."""
@@ -205,12 +201,7 @@ class ArduPilotVehicle(ArduPilotHost):
 
     def refusal_text(self, mode: ArduPilotMode, reason: str) -> str:
         """Return the text that reports a refused mode change."""
-        return f"Mode change to {mode.name} failed: {reason}"
-
-    @property
-    def auto(self) -> MissionMode:
-        """The mode that flies missions."""
-        return next(mode for mode in self._modes.values() if isinstance(mode, MissionMode))
+        return "Flight mode change failed"
 
     @property
     def first_mode(self) -> int:
@@ -263,6 +254,8 @@ class ArduPilotVehicle(ArduPilotHost):
         self.failsafes.start()
         # SITL is still in MAV_STATE_BOOT for about half a second after it has reported "ArduPilot Ready".
         self.call_later(0.25 * self.timeline.ready, self._leave_boot)
+        if self.KIND in ("copter", "rover"):
+            self.path.start()
 
     def _leave_boot(self) -> None:
         self.has_left_boot = True
@@ -325,15 +318,13 @@ class ArduPilotVehicle(ArduPilotHost):
             return MavResult.DENIED
         return self.change_to(custom_mode)
 
+    def enter_first_accepted(self, *modes: int) -> bool:
+        """Change to the first mode that is not refused. Return False if all modes are refused."""
+        return any(self.set_mode(mode) for mode in modes)
+
     def change_to(self, number: int) -> int:
         """Change the mode for a command and return the MAV_RESULT."""
         return MavResult.ACCEPTED if self.set_mode(number) else MavResult.FAILED
-
-    def mode_of(self, kind: type[ModeT]) -> ModeT:
-        """Return the mode object of the class ``kind``."""
-        mode = self._modes[kind.number]
-        assert isinstance(mode, kind)
-        return mode
 
     def available_modes(self) -> list[m.AvailableModes]:
         return [
@@ -372,4 +363,4 @@ class ArduPilotVehicle(ArduPilotHost):
     def _on_heartbeat(self, message: m.Heartbeat, _: Channel) -> None:
         sender_system, _component = sender_of(message)
         if sender_system == self.parameters["MAV_GCS_SYSID"]:
-            self.failsafes.ground_station_seen_at = self.now
+            self.ground_station_seen_at = self.now
