@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 
 import pytest
 from simulated_client import Client, flying_copter, ready_copter
@@ -234,3 +236,13 @@ def test_reboot_with_own_silence_resets_gimbal_and_devices(client: Client) -> No
     client.run(9.0)
     assert angles(client) == [0, -35, 0]
     assert (copter.camera.image_count, copter.devices.line_m) == (0, 0.0)
+
+
+def test_reboot_releases_previous_gimbal(client: Client) -> None:
+    copter = client.vehicle
+    assert isinstance(copter, SimulatedCopter)
+    previous = weakref.ref(copter.gimbal)
+    copter.reboot(1.0)
+    client.run(9.0)
+    gc.collect()
+    assert previous() is None

@@ -69,7 +69,6 @@ class ArduPilotGimbal:
         self._region: Ned | None = None  # region of interest; None if there is none
         self._followed_id = 0  # system id of the followed vehicle
         self._followed_place: Ned | None = None  # None until its position is received
-        vehicle.observe(m.GlobalPositionInt, self._on_global_position)
         vehicle.on(m.GimbalManagerSetAttitude, self._on_manager_message)
         vehicle.on(m.GimbalManagerSetPitchyaw, self._on_manager_message)
 
@@ -174,7 +173,7 @@ class ArduPilotGimbal:
         self._followed_place = None
         self.set_mode(MavMountMode.SYSID_TARGET)
 
-    def _on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
+    def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
         sender_system, _component = sender_of(message)
         if sender_system != self._followed_id:
             return

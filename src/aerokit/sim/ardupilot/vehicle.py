@@ -138,6 +138,8 @@ class ArduPilotVehicle(ArduPilotHost):
         self.serve_commands(self.make_commands())
         self.on(m.Heartbeat, self._on_heartbeat)
         self.on(m.SetMode, self._on_set_mode)
+        # A reboot creates another gimbal, so its method is looked up for each message.
+        self.observe(m.GlobalPositionInt, lambda message, channel: self.gimbal.on_global_position(message, channel))
         self.JOYSTICK(self)
         self.storage: VehicleStorage = ArduPilotStorage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
