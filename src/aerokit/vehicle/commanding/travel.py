@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -41,7 +41,7 @@ from aerokit.vehicle.commanding.progress import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from contextlib import AbstractContextManager
 
     from aerokit.autopilots import Mode
     from aerokit.vehicle.commanding.order import Order
@@ -517,10 +517,8 @@ class LookActions(VehicleBase):
         with self._new_roi_order() as order:
             await self._sender.send_long(order, command, *params)
 
-    @contextmanager
-    def _new_roi_order(self) -> Iterator[Order]:
-        with self._arbiter.auxiliary_order(self._arbiter.device_order(ROI)) as order:
-            yield order
+    def _new_roi_order(self) -> AbstractContextManager[Order]:
+        return self._arbiter.auxiliary_order(self._arbiter.device_order(ROI))
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:
