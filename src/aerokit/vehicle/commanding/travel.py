@@ -133,7 +133,7 @@ class TravelActions(VehicleBase):
         yaw = self._reposition_yaw(heading_deg)
         is_incomplete = False  # True once the vehicle has accepted the target, until the speed and the heading are set.
         try:
-            with self._flight_cleanup.flying(order):
+            with self._flight_cleanup.holding_if_abandoned(order):
                 unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
                 if unacknowledged_target is None:  # The vehicle keeps the altitude AMSL when home moves.
                     target = self._position.with_amsl_altitude(target)
@@ -156,10 +156,6 @@ class TravelActions(VehicleBase):
                     timeout=timeout,
                     max_silence_s=max_silence_s,
                 )
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the command, so it is ordered to hold.
-            self._flight_cleanup.hold_in_background(order)
-            raise
         except OperationRejected:
             # The vehicle is on its way, but the speed or the heading was refused or not sent. After a takeover,
             # `hold_in_background` sends nothing.
