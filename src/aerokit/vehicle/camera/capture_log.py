@@ -86,7 +86,7 @@ class CaptureLog:
 
     def __init__(self, link: CameraLink) -> None:
         self._link = link
-        self.end: EndSignal = link.end
+        self.end: EndSignal = link.session.end
         self._by_index: dict[int, _Entry] = {}
         # Indices of the captures that are being requested; an index that two calls request occurs twice.
         self._requested: list[int] = []
@@ -162,7 +162,9 @@ class CaptureLog:
         return newest is not None and (newest.img_idx - 1) % FEEDBACK_INDEX_RANGE != index
 
     def _on_message(self, message: Message) -> None:
-        self.record(message, capture_of(message, self._link.number or 0, self._link.now(), self._link.telemetry))
+        self.record(
+            message, capture_of(message, self._link.number or 0, self._link.now(), self._link.session.telemetry)
+        )
 
     def record(self, message: Message, capture: Capture) -> None:
         if isinstance(message, m.CameraImageCaptured):

@@ -23,7 +23,7 @@ from aerokit.vehicle.camera.values import CameraInformation, information_of
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
-    from aerokit.connection.bus import Detach, EndSignal
+    from aerokit.connection.bus import Detach
     from aerokit.events import Event
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
@@ -52,9 +52,8 @@ class CameraLink(CameraOrders):
         *,
         on_bound: Callable[[int], None] = lambda _: None,
     ) -> None:
-        self._context = context
-        self._session = context.session
-        self.end: EndSignal = context.session.end
+        self.context = context
+        self.session = context.session
         self._component_of = component_of
         # Called with the number of the camera as soon as it is known.
         self._on_bound = on_bound
@@ -78,7 +77,7 @@ class CameraLink(CameraOrders):
         self._heartbeat_at = -math.inf
         # True if an identified camera was silent and must identify itself again: another camera may now use its id.
         self._must_identify_again = False
-        self._session.on_reboot.append(self._on_reboot)
+        self.session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")
         self.listen(m.CameraInformation, self._on_information)
         self.listen(m.Heartbeat, self._on_heartbeat)
@@ -88,24 +87,16 @@ class CameraLink(CameraOrders):
     @property
     def is_trigger(self) -> bool:
         """True if the camera is only a trigger output of the autopilot."""
-        return self.is_autopilot_attached and self._session.autopilot.camera_by_trigger_only
+        return self.is_autopilot_attached and self.session.autopilot.camera_by_trigger_only
 
     @property
     def video_stream(self) -> int:
         """Stream id for recording commands; 0 means all streams. ArduPilot takes it for the number of the camera."""
-        return self.device_id if self._session.autopilot.video_addresses_camera else 0
-
-    @property
-    def telemetry(self) -> Any:
-        return self._session.telemetry
-
-    @property
-    def round_trip_s(self) -> float | None:
-        return self._session.link_watch.round_trip_s
+        return self.device_id if self.session.autopilot.video_addresses_camera else 0
 
     def publish(self, event_type: type[Event], *fields: Any) -> None:
         if not self.is_muted:
-            self._session.publish(event_type, *fields, self.component.component_id)
+            self.session.publish(event_type, *fields, self.component.component_id)
 
     def call_later(self, seconds: float, action: Callable[[], None]) -> None:
         """Call ``action`` after a delay. The end of the vehicle's `async with` block prevents the call."""
@@ -114,11 +105,11 @@ class CameraLink(CameraOrders):
             await anyio.sleep(seconds)
             action()
 
-        self._session.background.start(wait, "aerokit camera timer")
+        self.session.background.start(wait, "aerokit camera timer")
 
     def timeout_error(self, predicate: str) -> OperationTimeout:
         """Return an error with the text ``camera 100 <predicate>; <state of the link>``."""
-        return OperationTimeout(f"{self.describe()} {predicate}; {self._session.describe_link()}")
+        return OperationTimeout(f"{self.describe()} {predicate}; {self.session.describe_link()}")
 
     def describe(self) -> str:
         """Return e.g. ``camera 100 (Acme Zoom)``, for error texts."""
@@ -130,7 +121,7 @@ class CameraLink(CameraOrders):
     def bind(self, number: int, *, is_guess: bool = False) -> None:
         """Use the camera with this number. A guess is replaced by a later call, unless it has been given orders."""
         # Orders that were given to the guessed camera must not be repeated to another one.
-        has_given_orders = any(self._context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
+        has_given_orders = any(self.context.arbiter.latest(topic) is not None for topic in self._ordered_topics)
         if self._is_number_confirmed.is_set() or has_given_orders:
             return
         if not is_guess:
@@ -141,9 +132,9 @@ class CameraLink(CameraOrders):
     def _change_number(self, number: int) -> None:
         self.number = number
         self._on_bound(number)
-        component_id = self._session.component_id if number in AUTOPILOT_CAMERA_IDS else number
+        component_id = self.session.component_id if number in AUTOPILOT_CAMERA_IDS else number
         self._component = self._component_of(component_id)
-        self._heartbeat_at = self._session.connection.last_heartbeat_at(self._session.system_id, component_id)
+        self._heartbeat_at = self.session.connection.last_heartbeat_at(self.session.system_id, component_id)
         # What is known so far is about the camera that was guessed.
         self._forget_refusals()
         for cell in self._cells:
@@ -157,7 +148,7 @@ class CameraLink(CameraOrders):
         """Start polling state values in the background. Call it on the event loop's thread."""
         if not self._is_polling:
             self._is_polling = True
-            self._session.background.start(self.requests.run, "aerokit camera")
+            self.session.background.start(self.requests.run, "aerokit camera")
 
     async def identify(self) -> CameraInformation | None:
         """Find the camera, and request its information if that is not known yet.
@@ -182,7 +173,7 @@ class CameraLink(CameraOrders):
     async def _find_first_camera(self) -> None:
         # A camera with its own component id takes precedence over one that is attached to the autopilot, so
         # wait for the heartbeat of such a camera.
-        connected_for_s = self.now() - self._session.transfers.began_at
+        connected_for_s = self.now() - self.session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_number_confirmed.wait()
         if self.number is None:  # Until a camera sends a message, assume that one is attached to the autopilot.
@@ -240,8 +231,8 @@ class CameraLink(CameraOrders):
         return self.component._session.rates.request(message_type, rate_hz, is_optional=True)
 
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
-        cell: StateCell[Any] = self._session.connection.new_cell(name, waits_for)
-        self._session.register_cell(cell)
+        cell: StateCell[Any] = self.session.connection.new_cell(name, waits_for)
+        self.session.register_cell(cell)
         self._cells.append(cell)
         return cell
 
@@ -252,8 +243,8 @@ class CameraLink(CameraOrders):
         return cell
 
     def set_cell(self, cell: StateCell[Any], value: Any, message: Message) -> None:
-        component_id = self._session.component_id if self._component is None else self._component.component_id
-        cell.set(value, Source(self._session.system_id, component_id, message.NAME))
+        component_id = self.session.component_id if self._component is None else self._component.component_id
+        cell.set(value, Source(self.session.system_id, component_id, message.NAME))
 
     def listen(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
         """Call ``callback`` with this camera's messages of one type, as soon as the camera is bound."""
@@ -262,7 +253,7 @@ class CameraLink(CameraOrders):
             self._attach_listener(message_type, callback)
 
     def _attach_listener(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
-        bus, component_id = self._session.connection.bus, self.component.component_id
+        bus, component_id = self.session.connection.bus, self.component.component_id
 
         def on_message(message: Any) -> None:
             frame = message.received_frame
@@ -273,9 +264,9 @@ class CameraLink(CameraOrders):
                 callback(message)
 
         if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
-            detach = bus.attach(message_type, on_message, system_id=self._session.system_id)
+            detach = bus.attach(message_type, on_message, system_id=self.session.system_id)
             self._detach_listeners.append(detach)
-            self._session.at_close(detach)
+            self.session.at_close(detach)
 
     def _is_from_this_camera(self, message: Any) -> bool:
         if not self.is_autopilot_attached:
@@ -293,7 +284,7 @@ class CameraLink(CameraOrders):
             self._forget_refusals()
             self._must_identify_again = self.information._known
             if self._must_identify_again:
-                self._session.background.start(self._identify_again, "aerokit camera after silence")
+                self.session.background.start(self._identify_again, "aerokit camera after silence")
 
     async def _identify_again(self) -> None:
         with suppress(AerokitError):  # The next call to the camera identifies it again, and raises the error.
@@ -329,7 +320,7 @@ class ActiveOperation:
         self.order: Order = link.begin_order(subject)
         # True once the stop command was sent, or is no longer needed.
         self._is_over = False
-        self._detach_finish = link.on_finish(self._finish)
+        self._detach_finish = link.context.on_finish(self._finish)
 
     @asynccontextmanager
     async def starting(self) -> AsyncIterator[None]:

@@ -22,13 +22,11 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
     from contextlib import AbstractContextManager
 
-    from aerokit.connection.bus import Detach
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, SentCommand, Topic
     from aerokit.vehicle.components.component import Component
     from aerokit.vehicle.session.session import VehicleSession
-    from aerokit.vehicle.session.watch import VehicleWatch
 
 MessageT = TypeVar("MessageT", bound=Message)
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -68,8 +66,8 @@ class _ResendGuard:
 class CameraOrders:
     """Base class of `CameraLink`: sends commands to one camera. A newer order ends the retries of an earlier one."""
 
-    _context: VehicleContext
-    _session: VehicleSession
+    context: VehicleContext
+    session: VehicleSession
     _component: Component | None
     # Number of the camera: 1 to 6 if attached to the autopilot, otherwise its component id; None until bound.
     number: int | None
@@ -94,42 +92,33 @@ class CameraOrders:
         return self._component
 
     def now(self) -> float:
-        return self._session.connection.now()
+        return self.session.connection.now()
 
     def heartbeat_at(self) -> float:
         """Loop time of the camera's last HEARTBEAT; -inf while the autopilot is silent."""
-        received_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
+        received_at = self.session.connection.last_heartbeat_at(self.session.system_id, self.component.component_id)
         return received_at if self.is_autopilot_present else -math.inf
 
     @property
     def is_autopilot_present(self) -> bool:
-        return self._context.arbiter.is_state_recent
-
-    @property
-    def on_finish(self) -> Callable[[Callable[[], None]], Detach]:
-        return self._context.on_finish
+        return self.context.arbiter.is_state_recent
 
     def topic(self, subject: str) -> Topic:
         """Return the key of one function, such as ``"video"``. A new order replaces earlier ones with its key."""
         return ("camera", self.component.component_id, self.device_id, subject)
 
-    @property
-    def watch(self) -> VehicleWatch:
-        """Counts the reboots of the vehicle. After a reboot, no order is repeated."""
-        return self._session.watch
-
     def begin_order(self, subject: str) -> Order:
-        return self._context.arbiter.device_order(self._ordered_topic(subject), may_be_withdrawn=True)
+        return self.context.arbiter.device_order(self._ordered_topic(subject), may_be_withdrawn=True)
 
     def latest_order(self, subject: str) -> Order | None:
-        return self._context.arbiter.latest(self.topic(subject))
+        return self.context.arbiter.latest(self.topic(subject))
 
     def new_order(self, subject: str) -> AbstractContextManager[Order]:
         """Begin an order for a `with` block. If the block raises, the order is withdrawn.
 
         During the block, no camera that is found late takes the place of a guess.
         """
-        return self._context.arbiter.withdrawable_order(self._ordered_topic(subject))
+        return self.context.arbiter.withdrawable_order(self._ordered_topic(subject))
 
     def _ordered_topic(self, subject: str) -> Topic:
         topic = self.topic(subject)
@@ -152,10 +141,10 @@ class CameraOrders:
         """
         if order is not None and not order.is_newest:
             raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}", was_sent=False)
-        if order is not None and not self._session.is_closed:
+        if order is not None and not self.session.is_closed:
             order.was_sent = True
-        session, started_at = self._session, self._session.connection.now()
-        arbiter = self._context.arbiter
+        session, started_at = self.session, self.session.connection.now()
+        arbiter = self.context.arbiter
         ends_with_actions = attempts != 1 and not is_stop
         with (
             arbiter.auxiliary_order(order, ends_with_actions=ends_with_actions) as sent_order,
@@ -187,7 +176,7 @@ class CameraOrders:
         ``check_effect`` asks the camera, and returns None if there is no answer. A newer order and a reboot of the
         vehicle end the retries.
         """
-        reboots = self.watch.reboots
+        reboots = self.session.watch.reboots
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
                 await send()
@@ -201,7 +190,9 @@ class CameraOrders:
                 error.was_sent = error.was_sent or attempt > 1
                 had_effect = await check_effect() if order.is_newest else None
                 # A newer order may have been given while the camera was asked.
-                if not order.is_newest or self.watch.reboots != reboots:
+                if (
+                    not order.is_newest or self.session.watch.reboots != reboots
+                ):  # After a reboot, no order is repeated.
                     reason = SUPERSEDED if not order.is_newest else REBOOTED
                     error.args = (f"{error}; not sent again: {reason}",)
                     raise
@@ -212,7 +203,7 @@ class CameraOrders:
 
     def send_now(self, command: int, *params: float) -> bool:
         """Send a command once, without waiting for the acknowledgement. Return False if it was not sent."""
-        session = self._session
+        session = self.session
         # A link that is reopened may lead to another vehicle.
         if self._component is None or not session.is_open or session.is_held_back:
             return False
@@ -225,7 +216,7 @@ class CameraOrders:
         Does nothing if a newer order was given. With ``is_awaited``, this call waits for the acknowledgement and
         raises as :meth:`command`. Otherwise a failure is logged.
         """
-        if not order.is_newest or self._session.is_closed:
+        if not order.is_newest or self.session.is_closed:
             return
         was_just_sent = self.send_now(command, *params)
         failure: AerokitError | None = None
@@ -241,7 +232,7 @@ class CameraOrders:
                     if not is_awaited:
                         logger.warning("camera %s may not have stopped: %s", self.number, error)
 
-        task = self._session.background.start(confirm, "aerokit end of a camera's block")
+        task = self.session.background.start(confirm, "aerokit end of a camera's block")
         if task is None or not is_awaited:
             return
         await asyncio.wait((task,))  # The task continues if this call is cancelled.
@@ -256,7 +247,7 @@ class CameraOrders:
         """Wait for the acknowledgement of a stop command, and repeat the command if necessary."""
         if not was_just_sent:
             with anyio.move_on_after(MAX_SILENCE_S if is_awaited else None):
-                await self._session.wait_for_heartbeat()
+                await self.session.wait_for_heartbeat()
         if not order.is_newest:
             return
         try:
@@ -264,7 +255,7 @@ class CameraOrders:
         except CommandTimeout:
             if is_awaited:
                 raise
-            await self._session.wait_for_heartbeat()  # The command may have been lost in a silence.
+            await self.session.wait_for_heartbeat()  # The command may have been lost in a silence.
             await self.command(command, *params, order=order, is_stop=True)
 
 

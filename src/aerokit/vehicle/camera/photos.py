@@ -79,7 +79,7 @@ class Shutter:
             series_before = self.link.latest_order("series")
             status_before = await self.request_status_reliably()
             old_indices = {capture.index for capture in self.log.captures()}
-            watch = self.link.watch
+            watch = self.link.session.watch
             reboots, other_boots = watch.reboots, watch.other_boots
             # The error to raise at the time-out; None once the last order is acknowledged. It is set here, because the
             # time may expire while the first order waits for its acknowledgement.
@@ -96,7 +96,7 @@ class Shutter:
                     while capture := new_captures.pop():
                         if _is_new(capture, status_before, old_indices):
                             return self._successful(capture)
-                    round_trip_s = self.link.round_trip_s or 0.0
+                    round_trip_s = self.link.session.link_watch.round_trip_s or 0.0
                     has_arrived = await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s))
                     if has_arrived:
                         continue

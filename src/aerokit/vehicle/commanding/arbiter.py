@@ -216,7 +216,7 @@ class CommandArbiter:
     def on_reboot(self) -> None:
         reason = OTHER_BOOT if self._is_held_back() else REBOOTED
         for order in (*self._orders_in_progress, *self._posted_orders):
-            order.end_by_reboot(reason)
+            order.takeover_reason = order.takeover_reason or reason
         self._ordered_since_disarmed.clear()
         self._arming_order = None
         self.last_arming_at = math.inf  # Until the vehicle arms again, `current` ignores all orders.
@@ -293,7 +293,7 @@ class CommandArbiter:
         finally:
             self._posted_orders.remove(order)
             self._expect_late_effects(order)
-            order.close()
+            order.is_closed = True
 
     @contextmanager
     def sending(
@@ -382,7 +382,7 @@ class CommandArbiter:
     def clear_failsafe(self) -> None:
         for order in (self.newest, self._arming_order):
             if order is not None:
-                order.clear_failsafe()
+                order.failsafe = ""
 
     @property
     def may_be_executing(self) -> bool:

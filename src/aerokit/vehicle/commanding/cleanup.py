@@ -240,6 +240,16 @@ class FlightCleanup:
             if self._awaited_order is order:
                 self._awaited_order = None
 
+    @contextmanager
+    def holding_if_abandoned(self, order: Order) -> Iterator[None]:
+        """Like :meth:`flying`. If the block is cancelled or times out, order a hold: the vehicle may have the order."""
+        try:
+            with self.flying(order):
+                yield
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # also CommandTimeout and HeartbeatTimeout
+            self.hold_in_background(order)
+            raise
+
     @property
     def is_stream_open(self) -> bool:
         """True while the program streams set-points, or is about to. A stream needs its own flight mode."""

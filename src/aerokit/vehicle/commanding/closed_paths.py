@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from aerokit.vehicle.commanding.setpoints import TrajectorySetpoint
 
@@ -30,16 +30,7 @@ class CurvePoint(NamedTuple):
     second_derivative: Vector
 
 
-class ClosedPath:
-    """A closed curve around a center, with a phase that increases by 2π each round."""
-
-    first_phase: float = 0.0
-
-    def at(self, phase: float) -> CurvePoint:
-        raise NotImplementedError
-
-
-class Circle(ClosedPath):
+class Circle:
     """A circle; the phase is the bearing from its center in radians."""
 
     def __init__(self, radius_m: float, *, clockwise: bool, first_phase: float) -> None:
@@ -53,8 +44,10 @@ class Circle(ClosedPath):
         return CurvePoint((north, east), (-self._direction * east, self._direction * north), (-north, -east))
 
 
-class Eight(ClosedPath):
+class Eight:
     """A lemniscate along an axis; it begins and ends at its center."""
+
+    first_phase: float = 0.0
 
     def __init__(self, major_m: float, minor_m: float, axis_deg: float, *, clockwise: bool) -> None:
         self._major_m, self._axis = major_m, math.radians(axis_deg)
@@ -72,6 +65,10 @@ class Eight(ClosedPath):
         """Convert the components along the axis and across it (positive to the right) to north and east."""
         cos, sin = math.cos(self._axis), math.sin(self._axis)
         return along * cos - across * sin, along * sin + across * cos
+
+
+ClosedPath: TypeAlias = Circle | Eight
+"""A closed curve around a center, with a phase that increases by 2π each round."""
 
 
 class PathSetpoints:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import anyio
-
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
+from aerokit.errors import CommandRejected, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavLandedState
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.context import VehicleBase
@@ -96,13 +94,9 @@ class FlightActions(VehicleBase):
         modes = (plan.mode, plan.mode_after, take_off_mode)
         order = self._arbiter.order(*(mode for mode in modes if mode is not None))
         try:
-            with self._flight_cleanup.flying(order):
+            with self._flight_cleanup.holding_if_abandoned(order):
                 await self._begin_take_off(plan, order)
                 await self._await_altitude(altitude_m, plan, timeout, max_silence_s, order)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the command, so it is ordered to hold.
-            self._flight_cleanup.hold_in_background(order)
-            raise
         except CommandRejected as error:
             explained = self._with_landed_state(error)
             if explained is None:

@@ -250,12 +250,6 @@ class Order:
         """Make the order final, so that it can no longer be withdrawn."""
         self.previous = None
 
-    def close(self) -> None:
-        self.is_closed = True
-
-    def clear_failsafe(self) -> None:
-        self.failsafe = ""
-
     # -------------------------------------------------------------------- vehicle reports
 
     def on_mode(self, mode: Mode, reported_at: float) -> None:
@@ -309,9 +303,6 @@ class Order:
             self.is_confirmed = True
         elif armed_before and not armed and self._ends_on_disarm:
             self.takeover_reason = self.takeover_reason or "the vehicle disarmed"
-
-    def end_by_reboot(self, reason: str) -> None:
-        self.takeover_reason = self.takeover_reason or reason
 
 
 class SentCommand:

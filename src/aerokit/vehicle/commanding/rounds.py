@@ -107,7 +107,7 @@ class RoundFlight:
         hold_mode = context.sender.mode_for(self._operation, "hold")
         order = context.arbiter.order(mode, hold_mode)
         try:
-            with cleanup.flying(order):
+            with cleanup.holding_if_abandoned(order):
                 with context.arbiter.changing_mode():
                     send = self._session.commands.send_int
                     await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place_fields)
@@ -118,10 +118,6 @@ class RoundFlight:
                     await cleanup.stop_in(hold_mode, order)
             if radius_m and not holds_at_end:
                 context.vehicle_position.record_circle_radius(radius_m)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # also CommandTimeout and HeartbeatTimeout
-            # The vehicle may have received the command, so it is ordered to hold.
-            cleanup.hold_in_background(order)
-            raise
         except OperationRejected:
             if self._circle_problem:
                 cleanup.hold_in_background(order)

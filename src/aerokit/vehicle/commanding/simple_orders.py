@@ -7,7 +7,7 @@ the order documents its arguments, as in ``devices/actuators.py``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import anyio
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, Topic
-    from aerokit.vehicle.session.session import VehicleSession
+    from aerokit.vehicle.session.commands import CommandSender
 
 Firmware = Literal["ArduPilot", "ArduCopter", "ArduPlane", "Rover", "ArduSub", "PX4"]
 """Name of one firmware, or of an autopilot with all its firmwares."""
@@ -217,7 +217,10 @@ class SimpleOrder(Snapshot):
         detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
         try:
             # A vehicle that refuses requests for the message may still stream it.
-            if await _accepts_request(context, message_type.ID, target) or latest is not None:
+            refusal = await request_refusal(
+                session.commands, message_type.ID, component_id=target, attempts=2, attempt_timeout=1.0
+            )
+            if refusal is None or latest is not None:
                 await await_progress(
                     session,
                     self.name,
@@ -234,31 +237,17 @@ def _superseded_reason(order: Order | None) -> str | None:
     return SUPERSEDED if order is not None and not order.is_newest else None
 
 
-async def _accepts_request(context: VehicleContext, message_id: int, component_id: int) -> bool:
-    """Request a message. Returns False if the vehicle refuses."""
+async def request_refusal(
+    commands: CommandSender, message_id: int, *params: float, **options: Any
+) -> CommandRejected | None:
+    """Request a message. Returns the refusal; None if there was none, so that the message may arrive."""
     try:
-        await context.session.commands.send_long(
-            MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=2, attempt_timeout=1.0
-        )
-    except CommandTimeout:  # A vehicle that does not answer may still have the message.
-        return True
-    except CommandRejected:
-        return False
-    return True
-
-
-async def _is_request_refused(session: VehicleSession, message_id: int, component_id: int) -> bool:
-    """Request a message once. Returns True if the vehicle certainly refuses this request."""
-    may_get_late_ack = session.commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, component_id)
-    try:
-        await session.commands.send_long(
-            MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=1, attempt_timeout=0.5
-        )
+        await commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, *params, **options)
     except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
-        return False
-    except CommandRejected:
-        return not may_get_late_ack  # A late ack may be the refusal of an earlier request.
-    return False
+        return None
+    except CommandRejected as error:
+        return error
+    return None
 
 
 async def receive_once(
@@ -269,7 +258,11 @@ async def receive_once(
     target = session.component_id if component_id is None else component_id
     with session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages:
         for _ in range(RECEIVE_ATTEMPTS):
-            is_refused = await _is_request_refused(session, message_type.ID, target)
+            may_get_late_ack = session.commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, target)
+            refusal = await request_refusal(
+                session.commands, message_type.ID, component_id=target, attempts=1, attempt_timeout=0.5
+            )
+            is_refused = refusal is not None and not may_get_late_ack  # Else it may answer an earlier request.
             # After a refusal, only a message that has already arrived is returned.
             with anyio.move_on_after(0 if is_refused else 0.5):
                 async for message in messages:  # Other components may send the same message.

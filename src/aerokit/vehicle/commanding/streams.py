@@ -16,7 +16,6 @@ from aerokit.errors import (
     AerokitError,
     CommandRejected,
     OperationRejected,
-    OperationTimeout,
     ParameterTimeout,
     SetpointStreamStopped,
 )
@@ -300,13 +299,8 @@ class SteeringStream(ValueStream[ValueT]):
     async def _hold_and_wait(self) -> None:
         cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
         order = self._context.arbiter.order(hold_mode)
-        try:
-            with cleanup.flying(order):
-                await cleanup.stop_in(hold_mode, order)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The order to hold may have been lost. An OperationTimeout may be a CommandTimeout or a HeartbeatTimeout.
-            cleanup.hold_in_background(order)
-            raise
+        with cleanup.holding_if_abandoned(order):  # The order to hold may be lost.
+            await cleanup.stop_in(hold_mode, order)
 
     async def _enter(self, mode: Mode, order: Order) -> None:
         if self._needs_stream_before_mode:  # PX4 enters the mode only while it receives values.

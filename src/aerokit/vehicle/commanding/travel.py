@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -41,7 +41,7 @@ from aerokit.vehicle.commanding.progress import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from contextlib import AbstractContextManager
 
     from aerokit.autopilots import Mode
     from aerokit.vehicle.commanding.order import Order
@@ -133,7 +133,7 @@ class TravelActions(VehicleBase):
         yaw = self._reposition_yaw(heading_deg)
         is_incomplete = False  # True once the vehicle has accepted the target, until the speed and the heading are set.
         try:
-            with self._flight_cleanup.flying(order):
+            with self._flight_cleanup.holding_if_abandoned(order):
                 unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
                 if unacknowledged_target is None:  # The vehicle keeps the altitude AMSL when home moves.
                     target = self._position.with_amsl_altitude(target)
@@ -156,10 +156,6 @@ class TravelActions(VehicleBase):
                     timeout=timeout,
                     max_silence_s=max_silence_s,
                 )
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the command, so it is ordered to hold.
-            self._flight_cleanup.hold_in_background(order)
-            raise
         except OperationRejected:
             # The vehicle is on its way, but the speed or the heading was refused or not sent. After a takeover,
             # `hold_in_background` sends nothing.
@@ -517,10 +513,8 @@ class LookActions(VehicleBase):
         with self._new_roi_order() as order:
             await self._sender.send_long(order, command, *params)
 
-    @contextmanager
-    def _new_roi_order(self) -> Iterator[Order]:
-        with self._arbiter.auxiliary_order(self._arbiter.device_order(ROI)) as order:
-            yield order
+    def _new_roi_order(self) -> AbstractContextManager[Order]:
+        return self._arbiter.auxiliary_order(self._arbiter.device_order(ROI))
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:

@@ -19,7 +19,6 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import (
     CommandRejected,
-    CommandTimeout,
     FileFormatError,
     InvalidArgument,
     NotSupported,
@@ -29,6 +28,7 @@ from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavComponent, MavType
 from aerokit.mavlink.message import Message
+from aerokit.vehicle.commanding.simple_orders import request_refusal
 from aerokit.vehicle.components.session import WEB_SCHEMES, ComponentSession
 
 if TYPE_CHECKING:
@@ -256,12 +256,18 @@ class Component(ReadOnly):
             CommandRejected: the component refused.
             OperationTimeout: the message did not arrive.
         """
-        subscriber = self._session.subscriber
+        commands, subscriber = self._session.commands, self._session.subscriber
         with subscriber.subscribe((message_type,), capacity=100, overflow="drop_oldest", rate_hz=None) as answers:
             with anyio.move_on_after(timeout):
                 for attempt in range(1, REQUEST_ATTEMPTS + 1):
                     is_last = attempt == REQUEST_ATTEMPTS
-                    refusal = await self._request_once(message_type.ID, *params, is_last=is_last)
+                    may_get_late_ack = commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, self.component_id)
+                    refusal = await request_refusal(
+                        commands, message_type.ID, *params, component_id=self.component_id, attempts=1
+                    )
+                    # If the refusal may belong to an earlier request, it counts only after the last attempt.
+                    if may_get_late_ack and not is_last:
+                        refusal = None
                     if refusal is not None:
                         wait_s = 0.0  # Return the message only if it has arrived already.
                     elif is_last:
@@ -278,19 +284,6 @@ class Component(ReadOnly):
             f"component {self.component_id} sent no {message_type.NAME} within {timeout:g} s;"
             f" {self._session.describe_link()}"
         )
-
-    async def _request_once(self, message_id: int, *params: float, is_last: bool) -> CommandRejected | None:
-        """Request a message and return the refusal, if there is one."""
-        commands, command = self._session.commands, MavCmd.REQUEST_MESSAGE
-        may_get_late_ack = commands.may_get_late_ack(command, self.component_id)
-        try:
-            await commands.send_long(command, message_id, *params, component_id=self.component_id, attempts=1)
-        except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
-            return None
-        except CommandRejected as error:
-            # If the refusal may belong to an earlier request, it counts only after the last attempt.
-            return None if may_get_late_ack and not is_last else error
-        return None
 
     def subscribe(
         self,

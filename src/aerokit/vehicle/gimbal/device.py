@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 from aerokit._internal.values import Snapshot
 from aerokit.connection.cells import Source, StateCell
-from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalManagerCapFlags
+from aerokit.mavlink.enums import GimbalManagerCapFlags
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
 from aerokit.vehicle.session.subscriber import SUBSCRIPTION_HZ, WatchedStream
 
@@ -262,9 +262,6 @@ class GimbalDevice:
         self.failures = 0
         self.manager_information = None
         self.device_information = None
-
-    def describe_failures(self) -> str:
-        return str(GimbalDeviceErrorFlags(self.failures).name or self.failures) if self.failures else ""
 
     def _source(self, message: Message) -> Source:
         frame = message.received_frame

@@ -16,7 +16,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import GimbalDeviceFlags, MavMountMode
+from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalDeviceFlags, MavMountMode
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
 from aerokit.vehicle.commanding.order import REBOOTED, SUPERSEDED
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, POLL_INTERVAL_S, POSITION_MAX_AGE_S, ChangeSignal
@@ -182,7 +182,7 @@ def _describe_state(orders: GimbalOrders, since: float) -> str:
     if attitude.updated_at <= since:
         text += f", reported {attitude.age:.1f} s ago, before the order"
     if device.failures:
-        text += f", its failures are {device.describe_failures()}"
+        text += f", its failures are {GimbalDeviceErrorFlags(device.failures).name or device.failures}"
     if device.manager_information is not None:
         limits = information_of(device.device_id, orders.manager_id, device.manager_information, device=None)
         text += f", its limits are pitch {_format_limits(limits.pitch_deg)}, yaw {_format_limits(limits.yaw_deg)}"
