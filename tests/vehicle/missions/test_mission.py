@@ -336,11 +336,20 @@ async def test_mission_from_takeoff_to_end(opened: Any, end: MissionItem | None)
         assert sum(isinstance(event, events.MissionFinished) for event in observed) == 1
 
 
-async def test_without_mission_state_last_item_is_the_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """ArduPilot before 4.3: MISSION_CURRENT has the item alone."""
-    monkeypatch.setattr(MissionRun, "state", property(lambda _: MissionState.UNKNOWN))
+@pytest.fixture
+def without_mission_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ArduPilot before 4.3: MISSION_CURRENT has no mission state."""
+    build = MissionRun.message
+
+    def message(run: MissionRun, seq: int | None = None) -> m.MissionCurrent:
+        current = build(run, seq)
+        return m.MissionCurrent(current.seq, current.total, MissionState.UNKNOWN, current.mission_mode)
+
+    monkeypatch.setattr(MissionRun, "message", message)
+
+
+@pytest.mark.usefixtures("without_mission_state")
+async def test_without_mission_state_last_item_is_the_end() -> None:
     async with armed(open_flight) as flight:
         mission = flight.vehicle.mission
         await mission.start()
@@ -351,8 +360,8 @@ async def test_without_mission_state_last_item_is_the_end(
         assert all_of(reached)[-1].seq == mission.count.value
 
 
-async def test_without_mission_state_second_flight_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(MissionRun, "state", property(lambda _: MissionState.UNKNOWN))
+@pytest.mark.usefixtures("without_mission_state")
+async def test_without_mission_state_second_flight_is_waited_for() -> None:
     async with armed(open_flight) as flight:
         mission = flight.vehicle.mission
         await mission.start()

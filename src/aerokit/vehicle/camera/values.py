@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from aerokit._internal.formatting import enum_name
 from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import (
     CameraCapFlags,
@@ -343,7 +344,4 @@ def _text(raw: bytes) -> str:
 
 
 def _name(enum: type[IntEnum], number: int) -> str:
-    try:
-        return enum(number).name.lower()
-    except ValueError:
-        return "unknown"
+    return enum_name(enum, number, "unknown").lower()

@@ -13,6 +13,7 @@ import anyio
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit._internal.files import decompress
+from aerokit._internal.formatting import enum_name
 from aerokit._internal.values import Snapshot
 from aerokit.connection.bus import Overflow, Subscription
 from aerokit.connection.cells import Source, StateCell
@@ -84,15 +85,8 @@ def kind_of(heartbeat: Heartbeat | None, component_id: int) -> str:
     if is_autopilot(heartbeat):
         return "autopilot"
     if heartbeat.type != MavType.GENERIC:
-        return _name(MavType, heartbeat.type)
-    return _name(MavComponent, component_id)
-
-
-def _name(enum: type[MavType | MavComponent], number: int) -> str:
-    try:
-        return enum(number).name.lower()
-    except ValueError:
-        return "unknown"
+        return enum_name(MavType, heartbeat.type, "unknown").lower()
+    return enum_name(MavComponent, component_id, "unknown").lower()
 
 
 ItemT = TypeVar("ItemT", bound="Message | Event")

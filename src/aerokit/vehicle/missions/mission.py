@@ -350,15 +350,10 @@ class MissionControl(VehiclePlan["Mission"]):
         order = vehicle_context.arbiter.order(mode)
         self._order = order
         self._tracker.start()
-        try:
-            with vehicle_context.flight_cleanup.flying(order):
-                if first_item is not None:
-                    await self._set_current(first_item, timeout, order, keeps_jump_counts=False)
-                await self._enter_mode(mode, order, timeout)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            # The vehicle may have received the order.
-            vehicle_context.flight_cleanup.hold_in_background(order)
-            raise
+        with vehicle_context.flight_cleanup.holding_if_abandoned(order):
+            if first_item is not None:
+                await self._set_current(first_item, timeout, order, keeps_jump_counts=False)
+            await self._enter_mode(mode, order, timeout)
         if self._order is order:  # False if another task has paused the mission since.
             self._is_paused = False
 
