@@ -99,7 +99,7 @@ class EndpointStatistics(Snapshot):
     bytes_out: int
     """Bytes written; writes that the link dropped are counted in ``dropped["link"]``."""
     lost: int
-    """Number of frames that were sent to this endpoint but not received, by their sequence numbers."""
+    """Number of frames lost on the way from the peers to this endpoint, according to gaps in sequence numbers."""
     bad_bytes: int
     """Bytes outside valid frames."""
     waiting: int

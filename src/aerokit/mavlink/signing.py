@@ -321,7 +321,7 @@ class TimestampFile:
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Write ``timestamp + ahead``, unless the last write was of a timestamp later than ``timestamp``."""
+        """Write ``timestamp + ahead`` if ``timestamp`` has reached the timestamp of the last write; else do nothing."""
         if timestamp < self.timestamp:
             return
         # Set the attribute even if the write fails: a retry for every frame might block the event loop each time.

@@ -147,7 +147,7 @@ class SourceStatistics(SourceFields):
         self._returns = self._skipped_over = 0
 
     def _missing_shifted(self, advance: int) -> int:
-        """Return the bits of `_missing` for a `_missing_base` of `expected` + ``advance``."""
+        """Return `_missing` with its bits counted from `expected` + ``advance`` instead of `_missing_base`."""
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
