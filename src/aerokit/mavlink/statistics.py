@@ -160,7 +160,7 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        """Process an old frame that was not missing. Return a result of :meth:`out_of_order`."""
+        """Process an old frame that was not missing. Return the same kind of result as :meth:`out_of_order`."""
         # A single old frame is a repetition. Several with consecutive numbers show that the sender rebooted.
         follows_last_repetition = sequence == (self._repeated_sequence + 1) & 0xFF
         is_next_frame = follows_last_repetition and self._received_at_repetition == self.received

@@ -57,7 +57,7 @@ class OrderRefusalListener(Receiver, Protocol):
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that decides by `Link.keep_peer` which peers a link remembers, to exclude senders of noise.
+    """A receiver that calls `Link.keep_peer` for each peer that the link must remember, so that noise adds no peers.
 
     A link that wraps another link forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
