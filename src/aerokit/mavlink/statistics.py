@@ -94,7 +94,7 @@ class SourceStatistics(SourceFields):
         return self.lost / total if total else 0.0
 
     def has_duplicates(self, now: float) -> bool:
-        """Return True if two senders used these ids within the last seconds."""
+        """Return True if two senders have used these ids within the last 5 seconds."""
         return self._alternations >= _MIN_ALTERNATIONS and now - self._alternated_at < _EXPIRY_S
 
     def out_of_order(self, sequence: int, now: float) -> int:
