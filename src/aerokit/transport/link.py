@@ -37,7 +37,7 @@ class DrainListener(Receiver, Protocol):
     """A receiver that is notified when written data stays in this machine's buffers."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Called when unsent data has waited for a second without progress. Its commands may arrive late or never."""
+        """Called when unsent data has waited for a second without progress. Commands in it may be late or lost."""
 
     def link_drained(self, stalled_s: float) -> None:
         """Called when unsent data is sent at last, ``stalled_s`` seconds after `link_stalled`."""
