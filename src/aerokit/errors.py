@@ -82,7 +82,7 @@ class CommandTimeout(OperationTimeout):
     def __init__(self, message: str, *, was_sent: bool = True) -> None:
         super().__init__(message)
         self.was_sent: bool = was_sent
-        """False if the vehicle certainly does not execute the command, because it was not sent."""
+        """False if aerokit did not send the command. If True, the vehicle may have executed it."""
 
 
 class HeartbeatTimeout(OperationTimeout):

@@ -107,8 +107,8 @@ class VehicleRecovered(Event):
 class VehicleRebooted(Event):
     """The autopilot rebooted: its time since boot went backwards. aerokit requests message rates again.
 
-    Also published if the time since boot does not continue after a lost link was reopened, or cannot be compared: the
-    vehicle has rebooted, or the link leads to another vehicle.
+    After a lost link was reopened, this event is also published if the time since boot does not continue the earlier
+    times, or cannot be compared with them. The vehicle may have rebooted, or the link may lead to another vehicle.
     """
 
 
@@ -429,6 +429,6 @@ class LinkStatus(Snapshot):
     used_for: tuple[int, ...]
     """Ids of the systems whose traffic uses this link."""
     loss_percent: float | None
-    """Percentage of about the last dozen frames that were lost, for the system that loses most; None until known."""
+    """Percentage of lost frames among about the last dozen; None until known. With several systems, the highest one."""
     round_trip_s: float | None
     """Round-trip time (TIMESYNC) of the slowest system; None before the first answer."""

@@ -45,8 +45,8 @@ def lazy_exports(
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Create ``__getattr__``, ``__dir__`` and ``__all__`` of a package that imports its names on first use.
 
-    ``exports`` maps each module to the names to import from it. A name that the module does not define stands for the
-    module itself.
+    ``exports`` maps each module to the names to import from it. A name that the module does not define is
+    exported as the module itself.
     """
     # For type checkers, the package repeats the names as `import name as name` under TYPE_CHECKING.
     modules = {name: module for module, names in exports.items() for name in names}

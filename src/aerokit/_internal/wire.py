@@ -50,7 +50,7 @@ class _CounterFields:
 
 
 class Copyable:
-    """Makes objects copyable and picklable whose fields are defined in the compiled extension."""
+    """Mixin: supports copying and pickling for classes with fields that the compiled extension defines."""
 
     __slots__ = ()
 

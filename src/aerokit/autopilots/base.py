@@ -249,11 +249,14 @@ class Autopilot:
     erases_small_fences = False
     """True if a new fence of one or two circles may be erased just after its upload."""
     mission_completes_at_home = False
-    """True if a mission that ends with a return is reported as complete at home, False if when it starts to return."""
+    """Time at which a mission that ends with a return is reported as complete.
+
+    True: when the vehicle is at home. False: when it starts to return.
+    """
     holds_after_mission = False
     """True if the mode changes to the hold mode at the end of a mission."""
     mission_end_text: str | None = None
-    """Part of the status text at the end of a mission, but not of a mission that is invalid."""
+    """Part of the status text that reports the end of a mission. It is not sent for an invalid mission."""
     no_mission_text: str | None = None
     """Part of the status text of a vehicle that enters its mission mode without a mission to fly."""
     mission_starts_by_command = False
@@ -385,7 +388,7 @@ class Autopilot:
         return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name to store for a mode of AVAILABLE_MODES; None if the name is empty or the mode is known."""
+        """Return the name to store for a mode of AVAILABLE_MODES; None if ``name`` is empty or `modes` has the mode."""
         return name if name and custom_mode not in self.modes.numbers else None
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:

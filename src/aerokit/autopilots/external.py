@@ -29,11 +29,16 @@ class ExternalRule(Snapshot):
     """Parameter values with which the autopilot uses one kind of measurement."""
 
     required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()
-    """(names, allowed values) of each parameter on which the use of the measurement depends. The names are those of
-    one parameter in several firmware versions."""
+    """(names, allowed values) of parameters. The autopilot uses the measurement only if each has an allowed value.
+
+    ``names`` are the names of one parameter in different firmware versions.
+    """
     sole_source: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    """(name, values) of parameters. If they all have one of their values, the estimator's only source of position or
-    velocity is this measurement. The vehicle must have the first parameter; it may lack the others."""
+    """(name, values) of parameters that show whether this measurement is the only source of position or velocity.
+
+    It is if each parameter that the vehicle has is set to one of its ``values``. The vehicle must have the first
+    parameter, and may lack the others.
+    """
 
 
 class ExternalRules(Snapshot):

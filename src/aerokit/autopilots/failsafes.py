@@ -49,9 +49,10 @@ GCS_FAILSAFE_ACTIONS: Mapping[str, Mapping[str, Mapping[float, str]]] = {
     "ArduSub": {"FS_GCS_ENABLE": {0: _OFF, 1: "continues", 2: _TERMINATE, 3: "holds its depth", 4: "surfaces"}},
     "PX4": {"NAV_DLL_ACT": {0: _OFF, 1: _HOLD, 2: _RETURN, 3: "lands", 5: _TERMINATE, 6: _TERMINATE}},
 }
-"""Maps firmwares to the parameters that determine the action, the most important parameter first, and to the actions of
-their values. If a value is not listed, the next parameter decides. Sources: Parameters.cpp of ArduPilot's firmwares,
-navigator parameters of PX4.
+"""Actions of the ground station failsafe: firmware → parameter → value → action.
+
+The first parameter of a firmware decides if its value is listed; otherwise the next parameter decides. Sources:
+Parameters.cpp of ArduPilot's firmwares, navigator parameters of PX4.
 """
 
 

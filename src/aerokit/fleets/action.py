@@ -59,9 +59,9 @@ class ActionKind(enum.Enum):
     MOVES = enum.auto()
     """Flies the members somewhere, or changes how they fly."""
     ARMS = enum.auto()
-    """Only arms. Of the newer actions, only those that end the flight keep its members from starting."""
+    """Only arms. A newer action prevents a member from arming only if the newer action is of the kind ENDS_FLIGHT."""
     ON_GROUND = enum.auto()
-    """Does not move members, so they do not hold if the action is cancelled. ARMS and ENDS_FLIGHT do not either."""
+    """Does not move members. If an action of this kind, ARMS or ENDS_FLIGHT is cancelled, its members do not hold."""
     OTHER = enum.auto()
     """Any other action, for example a function of the program."""
 
@@ -94,9 +94,9 @@ class FleetAction:
         execute: coroutine function that is called with each available member.
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
-        kind: effect on the flight. If an action of the kinds MOVES and OTHER is cancelled, or a function of the program
-            raises an error, members that have already finished the action are told to hold.
-        corridors: the delay of each member, and how late it may start.
+        kind: effect on the flight. If an action of the kind MOVES or OTHER is cancelled, or if a function of the
+            program raises an error in it, members that have already finished the action are told to hold.
+        corridors: plan with a delay for each member, and a limit for how late a member may start; None: no such plan.
     """
 
     def __init__(
@@ -261,7 +261,7 @@ class FleetAction:
             raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
 
     async def _wait(self, member: Member, delay_s: float) -> None:
-        """Wait ``delay_s`` and for a recent HEARTBEAT. Raises as `_wait_to_start` does."""
+        """Wait ``delay_s`` seconds, then for a recent HEARTBEAT. Raises the errors of `_wait_to_start`."""
         connection, name = member.vehicle.connection, member.name
         began_at, absences = connection.now(), member.absences
         await anyio.sleep(delay_s)
@@ -469,7 +469,7 @@ def _newest_order(member: Member) -> Order | None:
 
 
 def _is_ending_flight(member: Member) -> bool:
-    """Return True while an order of this program to land or return is valid."""
+    """Return True if the newest order of this program is to land or return, and the member is not taken over."""
     newest = _newest_order(member)
     # It does not matter whether the block that gave the order has ended: the vehicle still executes the order.
     return newest is not None and newest.ends_flight and newest.is_newest and not newest.takeover_reason

@@ -117,8 +117,8 @@ class Fleet(Selection):
             rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
-            The number of MAVLink messages sent on the link that got the most. Corrections that another sender has just
-            sent on a link are not sent there again.
+            The number of MAVLink messages sent on one link; if it differs between links, the largest number. A link
+            does not get corrections that another sender has just sent on this link.
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.

@@ -341,7 +341,10 @@ class _System(NamedTuple):
 
 
 class _BlockFailed(Exception):
-    """Raised in each vehicle's block if the fleet's block has failed, so that a vehicle left flying is logged."""
+    """Raised in the `connect` block of each vehicle after an error in the fleet's block.
+
+    `connect` then closes the vehicle as after any error, and logs a vehicle that is still flying.
+    """
 
 
 class MemberConnections:

@@ -154,7 +154,7 @@ def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
 
 
 def _lower_bound(leg: Leg, other: Leg) -> float:
-    """Return a distance in metres that two legs have at least."""
+    """Return a lower bound, in metres, of the distance between two legs; it may be negative."""
     return math.dist(_midpoint(leg), _midpoint(other)) - _length(leg) / 2 - _length(other) / 2
 
 
@@ -167,7 +167,10 @@ def _midpoint(leg: Leg) -> tuple[float, ...]:
 
 
 def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
-    """Return the closest approach of two legs at times that differ by at most ``slack_s``; None if there is none."""
+    """Return the closest approach of two legs at times that differ by at most ``slack_s`` seconds.
+
+    Returns None if no such times exist.
+    """
     start, end = leg
     other_start, other_end = other
     vector = vector_between(start.place, end.place)

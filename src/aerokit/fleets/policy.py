@@ -109,7 +109,7 @@ class FleetResult(Mapping[str, Any]):
         self.stopped: dict[str, Exception] = dict(stopped)
         """Members that the policy stopped because another member failed."""
         self.skipped: dict[str, str] = dict(skipped)
-        """Unavailable members, which got no order, with the reason. They are no keys of the FleetResult."""
+        """Maps unavailable members, which got no order, to the reason. The FleetResult itself does not contain them."""
         self._outcomes = dict(outcomes)
         self._final_orders: Mapping[str, object] = {}  # `FleetContext.newest_orders` when each member finished
 

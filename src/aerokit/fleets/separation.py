@@ -25,7 +25,7 @@ __all__ = [
 DELAY_STEP_S = 1.0
 
 SLACK_S = 3.0
-"""How late a vehicle may start in its corridor, in seconds, if the program chooses no other ``slack_s``."""
+"""Default of ``slack_s``: the time in seconds by which a vehicle may start late on a path separated by time."""
 
 
 class Route(Snapshot):

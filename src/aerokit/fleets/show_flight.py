@@ -80,7 +80,7 @@ class ClockOffset(Snapshot):
 
 
 async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
-    """Measure the offset of a vehicle's clock by the TIMESYNC request with the shortest round trip.
+    """Measure the offset of a vehicle's clock by TIMESYNC. The request with the shortest round trip counts.
 
     Raises:
         OperationTimeout: no request was answered.

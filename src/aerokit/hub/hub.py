@@ -64,8 +64,8 @@ class Hub:
 
         Args:
             endpoints: connection strings, unopened links, or `Endpoint` with filters.
-            dialect: message definitions. Messages without a definition are forwarded unchecked: from known senders
-                only, and to endpoints without ``only``.
+            dialect: message definitions. Messages without a definition are forwarded without a check of
+                the checksum, but only from known senders, and only to endpoints whose ``only`` is empty.
 
         Raises:
             InvalidArgument: an address or a message name is wrong, or two endpoints have the same name.

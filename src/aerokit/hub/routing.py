@@ -87,12 +87,14 @@ class Ingress(Generic[PortT]):
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
         """Maps message id, target and sender (as one number) to the plan for frames that arrive at this port."""
         self.streams: dict[bytes, ForwardingPlan[PortT]] = {}
-        """Maps sender and message, as bytes of a frame, to the plan for broadcasts of senders that this port reaches.
+        """Plans for messages without a target field, from senders whose port this is; not for HEARTBEAT.
+
+        The keys are bytes 4 to 8 of `Frame.body`: system id, component id and message id.
         """
         self.destinations: dict[tuple[PortT, ...], tuple[PortT, ...]] = {}
         """Maps each tuple of ports to the equal tuple that all plans use."""
         self.echoes: dict[int, int] = {}
-        """Maps senders to the number of returning frames minus the number of new frames at this port."""
+        """Maps senders to a count, 0 to `MIN_LOOP_FRAMES`: a returning frame adds 1, a new frame subtracts 1."""
         self.loop_until: float = -math.inf
         """Returning frames are dropped until this time."""
 
@@ -413,8 +415,8 @@ class Router(Generic[PortT]):
     ) -> list[int]:
         """Return the ports for a message from ``sender`` to a component, or to a whole system (component 0).
 
-        An empty list means that the target is unknown. A message of a sender to itself goes back to ``ingress_number``,
-        where the caller drops it, because this is no error.
+        An empty list means that the target is unknown. If the target is the sender itself, the list has
+        ``ingress_number``; the caller then drops the message without reporting an unknown target.
         """
         target = self._senders.get(system_id | component_id << 8) if component_id else None
         if target is not None:

@@ -28,9 +28,9 @@ NEW_PORT_WINDOW_S = 0.1
 """Like `DUPLICATE_WINDOW_S`, for a port added after the earlier frame arrived. A program takes longer to restart."""
 
 LOOP_WINDOW_S = 60.0
-"""A frame that returns through another port is recognised up to this time after it was first received.
+"""Seconds after the first reception of a frame in which its return through another port is recognised.
 
-It is below 256 s, after which the sequence numbers of a component that sends only heartbeats repeat.
+The value is below 256 s, because the sequence numbers of a component that sends only heartbeats repeat after 256 s.
 """
 
 MIN_LOOP_FRAMES = 8
@@ -104,7 +104,10 @@ class Sender:
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:
-        """Record a frame at another port than `port_number`. Return True if the routes change."""
+        """Record a frame at another port than `port_number`. Return True if the routes change.
+
+        If ``must_move`` is True, or after a silence at `port_number`, port ``number`` becomes the `port_number`.
+        """
         is_new_there = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
         if must_move or now - self.received_at > ROUTE_TIMEOUT_S:
@@ -163,7 +166,7 @@ class RecentFrames:
 
 
 REPEAT_EVENT_S = 60.0
-"""Minimum interval of events about duplicate senders under the ids of one autopilot, for any number of peers."""
+"""Seconds in which the use of one autopilot's ids by other peers is reported once, for all these peers together."""
 
 
 class IdentityGuard:

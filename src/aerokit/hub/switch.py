@@ -89,7 +89,7 @@ class Switch:
         self._queueing_ports.clear()
 
     def arrival_time(self, now: float) -> float:
-        """Return the earliest possible receive time of data that is read now."""
+        """Return the earliest time at which data that is read now may have arrived; after a pause, before ``now``."""
         # The data may have waited in a socket since the loop last ran, or while the computer was suspended.
         watch = self._loop_watch
         return watch.arrival_time(now) if now > watch.late_after else now

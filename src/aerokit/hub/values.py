@@ -47,7 +47,7 @@ class Endpoint(Snapshot):
     peers: PeerFilter | None = None
     """IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all."""
     baud: int = 57600
-    """Bits per second of a serial link whose address does not give them."""
+    """Bits per second of a serial link, if `address` does not give a baud rate."""
     retry_open: bool = False
     """True to start the hub even if this endpoint cannot be opened yet (a server that starts later), and to retry."""
 
@@ -99,7 +99,7 @@ class EndpointStatistics(Snapshot):
     bytes_out: int
     """Bytes written; writes that the link dropped are counted in ``dropped["link"]``."""
     lost: int
-    """Number of frames that were sent to this endpoint but not received, by their sequence numbers."""
+    """Number of frames lost on the way from the peers to this endpoint, according to gaps in sequence numbers."""
     bad_bytes: int
     """Bytes outside valid frames."""
     waiting: int

@@ -126,7 +126,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum, as one XML file defines it, or with the entries of all files (`merged_enums`)."""
+    """One enum. Has the entries of one XML file or, from `merged_enums`, of all files."""
 
     name: str
     entries: tuple[EntryDefinition, ...]

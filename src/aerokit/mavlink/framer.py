@@ -363,7 +363,7 @@ class PythonFramer:
 
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
-    """Return the first of these positions in the data. -1 stands for a position that is missing."""
+    """Return the lowest of these positions in the data. -1 for ``keep_from`` or ``unknown_begin`` means none."""
     if unknown_begin >= 0:  # `_search` sets `unknown_begin` only before `keep_from`.
         return unknown_begin
     return position if keep_from < 0 else keep_from

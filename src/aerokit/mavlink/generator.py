@@ -76,7 +76,10 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that is first in `STANDARD_FILES`. Use the remarks of ``added``, if any."""
+    """Return a copy of ``existing`` with the origin of either that comes first in `STANDARD_FILES`.
+
+    If ``added`` has remarks, they replace those of ``existing``.
+    """
     origin = min(
         existing.origin,
         added.origin,

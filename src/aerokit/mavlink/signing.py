@@ -183,7 +183,7 @@ class Signing:
         # The key is the first input of each signature's hash. It is hashed once, and the hash object is then copied.
         self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
-        """Last timestamp of each (system id, component id, link id). :meth:`for_link` shares it among links."""
+        """Last timestamp of each (system id, component id, link id). Objects from :meth:`for_link` share this dict."""
 
     def for_link(self, link_id: int) -> Signing:
         """Return a `Signing` for another link (0–255) with the same key.
@@ -259,7 +259,7 @@ class Signing:
         return refusal
 
     def _refusal(self, frame: Frame, now: float) -> Refusal | None:
-        """Return the reason why a frame has no valid signature; None if it has one."""
+        """Return the reason to refuse a frame; None if its signature is valid and its timestamp is new."""
         if not frame.incompat_flags & SIGNED:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
@@ -321,7 +321,7 @@ class TimestampFile:
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Write ``timestamp + ahead``, unless the last write was of a timestamp later than ``timestamp``."""
+        """Write ``timestamp + ahead`` if ``timestamp`` has reached the timestamp of the last write; else do nothing."""
         if timestamp < self.timestamp:
             return
         # Set the attribute even if the write fails: a retry for every frame might block the event loop each time.

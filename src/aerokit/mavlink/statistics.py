@@ -94,7 +94,7 @@ class SourceStatistics(SourceFields):
         return self.lost / total if total else 0.0
 
     def has_duplicates(self, now: float) -> bool:
-        """Return True if two senders used these ids within the last seconds."""
+        """Return True if two senders have used these ids within the last 5 seconds."""
         return self._alternations >= _MIN_ALTERNATIONS and now - self._alternated_at < _EXPIRY_S
 
     def out_of_order(self, sequence: int, now: float) -> int:
@@ -147,7 +147,7 @@ class SourceStatistics(SourceFields):
         self._returns = self._skipped_over = 0
 
     def _missing_shifted(self, advance: int) -> int:
-        """Return the bits of `_missing` for a `_missing_base` of `expected` + ``advance``."""
+        """Return `_missing` with its bits counted from `expected` + ``advance`` instead of `_missing_base`."""
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
@@ -160,7 +160,7 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        """Process an old frame that was not missing. Return a result of :meth:`out_of_order`."""
+        """Process an old frame that was not missing. Return the same kind of result as :meth:`out_of_order`."""
         # A single old frame is a repetition. Several with consecutive numbers show that the sender rebooted.
         follows_last_repetition = sequence == (self._repeated_sequence + 1) & 0xFF
         is_next_frame = follows_last_repetition and self._received_at_repetition == self.received

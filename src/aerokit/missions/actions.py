@@ -38,7 +38,8 @@ def change_speed(
 ) -> MissionItem:
     """Change the speed (0 to 1,000 m/s).
 
-    -2 stands for the vehicle's default speed (ArduCopter ignores it), -1 for no change (PX4: the default speed).
+    A speed of -2 means the vehicle's default speed; ArduCopter ignores -2. A speed of -1 means no change; PX4 instead
+    sets the default speed.
     ``kind`` selects the speed; ``"climb"`` and ``"descent"`` are for copters. ``throttle_percent`` (0 to 100) is for
     planes without airspeed sensor; None leaves it unchanged.
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_CHANGE_SPEED
@@ -134,8 +135,8 @@ def set_relay(relay: int, on: bool) -> MissionItem:
 def jump(to_item: int, *, repeat: int = -1) -> MissionItem:
     """Jump to another item of the mission, ``repeat`` times (0 to 32,767; -1: without limit).
 
-    For any autopilot, items are counted from 0 without home, as in :class:`Mission`: ``jump(0)`` goes to the first
-    item. https://mavlink.io/en/messages/common.html#MAV_CMD_DO_JUMP
+    ``to_item`` is an index in :class:`Mission`, for any autopilot: 0 is the first item, and home does not count.
+    https://mavlink.io/en/messages/common.html#MAV_CMD_DO_JUMP
     """
     # For ArduPilot, where home is item 0, the number is sent increased by 1. It must still fit into 16 bits.
     target = whole_number("to_item", to_item, 0, 65_534)

@@ -153,7 +153,7 @@ def _px4_form(item: MissionItem) -> str:
 
 
 def _stored_as(letter: str, value: float) -> float | None:
-    """Return ``value`` as an autopilot sends it back if it has stored it in the form that ``letter`` stands for.
+    """Return the number that an autopilot sends back after it has stored ``value`` in the form ``letter``.
 
     Returns None if the autopilot cannot store the value.
     """

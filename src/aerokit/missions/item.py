@@ -153,7 +153,7 @@ def canonical_frame(frame: int) -> int:
 
 
 def has_place(command: int) -> bool:
-    """Return True if x and y are coordinates. Commands from other dialects count as such."""
+    """Return True if x and y of the command are coordinates, and for all commands outside the standard."""
     return command in PLACES or command not in _STANDARD_COMMANDS
 
 
@@ -261,7 +261,7 @@ def place_item(
     *parameters: float,
     is_needed: bool = False,
 ) -> MissionItem:
-    """Create an item at a place. Without a place, x and y are 0, which ArduPilot takes for the current position.
+    """Create an item at a place. If no place is given, x and y are 0; ArduPilot then uses the current position.
 
     Exactly one of the ``altitudes`` must be given, unless the place is a Position with an altitude. With ``is_needed``,
     a missing place raises InvalidArgument.

@@ -117,10 +117,10 @@ def read_entries(values: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
 def merged_entries(
     entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
 ) -> list[Any]:
-    """Return the new entries of ``mission.items`` in a .plan file, so that they contain ``items``.
+    """Return new entries for ``mission.items`` of a .plan file, which together contain ``items``.
 
-    ``entries`` are the old entries, and ``groups`` their items. Old entries at the beginning and at the end are kept if
-    their items are unchanged.
+    ``entries`` are the old entries, and ``groups`` the items of each old entry. Old entries at the beginning and at the
+    end are kept if their items are unchanged.
     """
     targets = {item.param1 for item in items if item.command == MavCmd.DO_JUMP}
 

@@ -44,7 +44,7 @@ class LinkAddress(Snapshot):
     baud: int | None = None
     """Bits per second; None if not given."""
     path: str = ""
-    """Path of a recording or of a pseudo-terminal's symbolic link ("": none), or "fleet/name" on a zenoh network."""
+    """Path of a recording or of a pseudo-terminal's symbolic link, or the zenoh name "fleet/name"; "" if not given."""
     options: tuple[tuple[str, str], ...] = ()
     """(name, value) pairs sorted by name: ``rtscts``, ``costly`` ("1"), ``speed``, ``timeout`` (s), options of zenoh.
     """

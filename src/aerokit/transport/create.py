@@ -21,7 +21,7 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
 
     Args:
         address: a connection string, or the result of :func:`parse_address`.
-        baud: bits per second of a serial port whose string does not give them.
+        baud: bits per second of a serial port, if the connection string does not give a baud rate.
         peers: IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all.
 
     Raises:

@@ -37,7 +37,7 @@ class DrainListener(Receiver, Protocol):
     """A receiver that is notified when written data stays in this machine's buffers."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Called when unsent data has waited for a second without progress. Its commands may arrive late or never."""
+        """Called when unsent data has waited for a second without progress. Commands in it may be late or lost."""
 
     def link_drained(self, stalled_s: float) -> None:
         """Called when unsent data is sent at last, ``stalled_s`` seconds after `link_stalled`."""
@@ -57,7 +57,7 @@ class OrderRefusalListener(Receiver, Protocol):
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that decides by `Link.keep_peer` which peers a link remembers, to exclude senders of noise.
+    """A receiver that calls `Link.keep_peer` for each peer that the link must remember, so that noise adds no peers.
 
     A link that wraps another link forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """

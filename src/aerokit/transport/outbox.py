@@ -106,9 +106,10 @@ class Outbox:
         self._forwarded_bytes -= count
 
     def drop_forwarded_if_late(self, size: int) -> bool:
-        """Count the data forwarded last as dropped if it has waited too long. Return True if the data is dropped.
+        """Return True if the last forwarded write has waited too long, and count it as dropped.
 
-        Call it before the transport sends the first of these ``size`` bytes.
+        Call this method before the transport sends the first of the ``size`` bytes of this write. If the result is
+        True, the caller must not send them.
         """
         count, deadline = self._last_forwarded
         if self._loop.time() < deadline:

@@ -20,7 +20,7 @@ MAX_GAP_S = 60.0
 
 
 class Replay(BaseLink):
-    """A link that delivers the frames of a recording, one per callback. At the end, it is lost with RecordingEnded.
+    """A link that delivers the frames of a recording, one per callback, and then calls `link_lost` with RecordingEnded.
 
     ``speed`` 1.0 is the original speed, 2.0 takes half the time, None or infinity is as fast as possible. Writes are
     ignored and counted in `ignored_writes`.

@@ -206,7 +206,7 @@ class TcpListen(_TcpLink):
             self._kept.add(peer)
 
     def forget_peer(self, peer: Peer) -> None:
-        """See `Link.forget_peer`. Afterwards, a new client may take its place."""
+        """See `Link.forget_peer`. The client stays connected, but a new client may replace it."""
         self._kept.discard(peer)
 
     def has_peer(self, peer: Peer) -> bool:

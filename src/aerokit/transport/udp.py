@@ -286,7 +286,7 @@ class UdpBroadcast(_UdpLink):
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
-        """Return True if datagrams of a sender other than the present peer may be delivered."""
+        """Return True if datagrams from ``source``, which is not the present peer, may be delivered."""
         host, *_ = source
         # Another port of the same host need not wait for silence if a `PeerKeeper` checks its frames.
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host

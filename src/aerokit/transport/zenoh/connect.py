@@ -95,7 +95,10 @@ class ZenohConnect(NetworkLink):
 
     @property
     def late_frames(self) -> int:
-        """Number of datagrams and beacons (not of MAVLink frames) dropped because they arrived more than 2 s late."""
+        """Number of datagrams and beacons dropped because they arrived more than 2 s late.
+
+        A datagram may contain several MAVLink frames.
+        """
         return self._tracker.late
 
     def write(self, data: bytes, peer: Peer = None) -> None:

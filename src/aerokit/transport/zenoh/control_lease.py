@@ -202,7 +202,10 @@ class ClientFilter:
     def _refuse(
         self, frame: Frame, reason: str, now: float, *, holder: str | None = None, is_late: bool = False
     ) -> list[RefusalNotice]:
-        """Count a refused frame. Return a notice, or nothing if one about this message was sent a moment ago."""
+        """Count a refused frame. Return a list with a notice for the client, or an empty list.
+
+        A notice without an answer is left out for `NOTICE_INTERVAL_S` after a notice about the same type of message.
+        """
         self.refused += 1
         message = _decoded(frame)
         name = f"message {frame.message_id}" if message is None else message.NAME

@@ -129,7 +129,7 @@ class ZenohListen(NetworkLink):
         self._send_beacon()
 
     def _find_conflict(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
-        """Subscribe to beacons, and check whether the name may be in use. Runs on a thread of the executor."""
+        """Subscribe to beacons, and look for tokens of servers with this name. Runs on a thread of the executor."""
 
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
