@@ -226,6 +226,7 @@ def test_command_int_is_resent_unchanged() -> None:
     [
         ((math.inf,), "param1 = inf is not a finite 32-bit float"),
         ((1e39,), "is not a finite 32-bit float"),
+        ((10**400,), "is not a finite 32-bit float"),
         ((0, "up"), "param2 = 'up' is not a number"),
         (tuple(range(8)), "at most 7 parameters"),
     ],

@@ -435,6 +435,8 @@ def _checked_number(command: int, field: str, value: float) -> float:
         number = float(value)
     except (TypeError, ValueError):
         raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not a number") from None
+    except OverflowError:  # an int beyond the range of float
+        number = math.inf
     if math.isinf(number) or abs(number) > FLOAT32_MAX:  # NaN is allowed: many commands use it for "unchanged".
         raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not a finite 32-bit float")
     return number
