@@ -80,8 +80,8 @@ async def connect(
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …, or a
             link; a list of these, if several links lead to the same vehicle (docs/how-to/several-links.md); or an open
-            connection, to use several vehicles on one link. The arguments after ``rates`` are not allowed with an open
-            connection; pass them to ``open_connection``.
+            connection, to use several vehicles on one link. With an open connection, pass the arguments after
+            ``rates`` to ``open_connection`` instead.
         system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
         timeout: seconds to wait for the vehicle's first heartbeat, above 0.
         rates: rates to request instead of the default ones, as a mapping of message class to Hz (above 0, at most
@@ -199,7 +199,7 @@ async def _attached(
     timeout: float,
     rates: Mapping[type[Message], float] | None,
 ) -> AsyncIterator[Vehicle]:
-    """Find a vehicle on an open connection. The connection stays open when the block ends."""
+    """Context manager: find a vehicle on an open connection, and release it at the end. The connection stays open."""
     context, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
     was_left_by_exception = False
     try:
@@ -255,7 +255,7 @@ _Found = tuple[VehicleContext, Vehicle, Heartbeat]
 
 
 class _Search:
-    """Creates the vehicle while its first heartbeat is being delivered, so that no later message is missed.
+    """Creates the vehicle in the callback for its first heartbeat, so that the vehicle misses no later message.
 
     A task that waits for the heartbeat would create the vehicle too late: a recording replayed at full speed delivers
     many messages in one iteration of the loop.
@@ -289,7 +289,7 @@ class _Search:
         self._ended.set()
 
     def _has_sent_enough(self, frame: Frame) -> bool:
-        """Count a heartbeat. Return True after ``MIN_LONE_HEARTBEATS`` of the same sender."""
+        """Count the heartbeat. Return True if its sender has sent at least ``MIN_LONE_HEARTBEATS``."""
         source = (frame.system_id, frame.component_id)
         counts = self._heartbeat_counts
         if source not in counts and len(counts) >= MAX_ROUTES:  # A faulty sender may use many ids.

@@ -117,7 +117,7 @@ class Vehicle(
     def camera(self) -> Camera:
         """The first camera found with its own component id; if none was found, one attached to the autopilot.
 
-        The calls of this object wait briefly until a camera is found. ``camera_at`` returns any other camera.
+        If no camera was found yet, its methods wait briefly for one. Use :meth:`camera_at` for any other camera.
         """
         return self._cameras.first
 
@@ -286,7 +286,7 @@ class Vehicle(
 
     @cached_property
     def calibrate(self) -> CalibrationControl:
-        """Calibrations of sensors, radio and ESCs, step by step."""
+        """Calibration of sensors, radio and ESCs."""
         from aerokit.vehicle.calibration.calibration import CalibrationControl
 
         return CalibrationControl(self._context, lambda: self.parameters)
@@ -366,8 +366,8 @@ def overview(vehicle: Vehicle) -> dict[str, Any]:
     Returns:
         ``system_id``, ``autopilot`` and ``firmware`` (names), ``vehicle_type`` (MAV_TYPE), ``link`` and ``states``.
         ``link`` has ``state`` (of :class:`aerokit.LinkState`), ``heartbeat_age_s``, ``frames_received`` and
-        ``frames_lost`` (gaps in the sequence numbers). ``states`` has, for each state of docs/states.md with a value,
-        ``value`` (converted by :func:`aerokit._internal.formatting.to_jsonable`) and ``age_s``, its age in seconds.
+        ``frames_lost`` (gaps in the sequence numbers). ``states`` maps the name of each known state (docs/states.md) to
+        its ``value`` (converted by :func:`aerokit._internal.formatting.to_jsonable`) and its ``age_s`` in seconds.
     """
     from aerokit._internal.formatting import to_jsonable
 

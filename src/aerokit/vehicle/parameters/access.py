@@ -49,7 +49,10 @@ MAX_READ_BACK = 100
 
 
 class ParameterAccess:
-    """Access to the parameters of one vehicle by the names in its firmware. Other names are not translated."""
+    """Downloads, reads and writes the parameters of one vehicle, by the names that its firmware uses.
+
+    :class:`NameResolver` finds these names if the program uses others.
+    """
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
@@ -93,7 +96,7 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> ParameterTable:
-        """Return the whole list, and download it only if necessary."""
+        """Return all parameters. Download them if some are unknown, or if ``refresh`` is True."""
         async with self._download_lock:
             if self.store.is_complete and not refresh:
                 return self.store.table
@@ -130,7 +133,7 @@ class ParameterAccess:
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Cancel the block and raise FileTimeout if no MAVFTP answer arrives soon."""
+        """Context manager: cancel its block and raise FileTimeout if no MAVFTP answer arrives within a few seconds."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         # Some relays drop only MAVFTP, so do not wait for the idle time-out.
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
@@ -177,7 +180,7 @@ class ParameterAccess:
                 return
 
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
-        """Return a copy whose missing defaults are taken from an earlier download."""
+        """Return a copy of ``table``. Defaults that it lacks are taken from the parameters that were known before."""
         known = self.store.table
         parameters = []
         for parameter in table.values():
@@ -206,7 +209,10 @@ class ParameterAccess:
     async def read(
         self, names: Iterable[str], idle_timeout_s: float, *, probe: bool = False
     ) -> dict[str, ParameterAnswer]:
-        """Read parameters. Set ``probe`` for names that the vehicle may not have."""
+        """Request parameters from the vehicle. Return a parameter or an error for each name.
+
+        Set ``probe`` to True if the vehicle may not have all of them.
+        """
         names = tuple(names)
         if not names:
             return {}
@@ -237,7 +243,7 @@ class ParameterAccess:
             return await transfers.run(exchange)
 
     def _read_later(self, name: str, at: float) -> None:
-        """Read a parameter in the background, at a time of the event loop's clock."""
+        """Schedule a background read of a parameter at the time ``at`` of the event loop's clock."""
 
         async def read() -> None:
             await anyio.sleep(at - self._transfers.connection.now())
@@ -252,9 +258,9 @@ class ParameterAccess:
 
     @contextmanager
     def _raised_rate(self, after_s: float | None = 0.0) -> Iterator[None]:
-        """Raise the rate at which ArduPilot handles parameters, from ``after_s`` seconds on until the block ends.
+        """Context manager: raise the rate at which ArduPilot handles parameters ``after_s`` seconds after entry.
 
-        None leaves the rate unchanged.
+        The rate is restored at the end of the block. If ``after_s`` is None, the rate is not changed.
         """
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s is None:
@@ -339,9 +345,9 @@ class ParameterAccess:
             self._read_later(name, self._transfers.connection.now() + STALE_VALUE_S)
 
     def is_in_doubt(self, name: str) -> bool:
-        """Return True if the known value may be outdated.
+        """Return True if the known value may be wrong because of the last write by this program.
 
-        The last write was cancelled or not confirmed, or a message with another value has arrived after it.
+        This is so if the write was cancelled or not confirmed, or if the known value differs from the written one.
         """
         if name not in self.written:
             return False
@@ -368,9 +374,9 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
-        """Write parameters in one file if possible.
+        """Write parameters in one file, or one by one, as ``method`` says.
 
-        Those that the vehicle did not apply are then set one by one.
+        After a file, all values are read back, and those that the vehicle did not apply are set one by one.
         """
         parameters = tuple(parameters)
         if not parameters:
@@ -429,7 +435,7 @@ class _CachedList:
         self._hash: int | None = None
 
     async def load_if_current(self, *, refresh: bool) -> bool:
-        """Use the cached list. Return False if it is outdated, or if ``refresh`` is True."""
+        """Put the cached list into the store. Return False if it is missing or outdated, or if ``refresh`` is True."""
         store = self._access.store
         key = await self._key()
         updates_before = store.updates

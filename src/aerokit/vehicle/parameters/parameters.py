@@ -44,8 +44,8 @@ class Parameters(ReadOnly):
     no longer has causes an :class:`aerokit.parameters.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters, and restores the rate at the end. For unknown names, which the vehicle may
-    not have, it raises the rate after half a second.
+    while it reads more than five parameters, and restores the rate at the end. While it reads fewer parameters that the
+    vehicle may not have, it raises the rate after half a second without an answer.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -67,25 +67,25 @@ class Parameters(ReadOnly):
         return self._access.store.table
 
     def known(self, name: str) -> Parameter | None:
-        """Return the last known parameter with this name, like ``table.get(name)`` but without building a table."""
+        """Return the known parameter with this name, or None. Like ``table.get(name)``, but does not build a table."""
         return self._access.store.get(name)
 
     @property
     def is_complete(self) -> bool:
-        """True if the whole list was downloaded since the vehicle started."""
+        """True if all parameters were downloaded since the vehicle started, and since the link was last reopened."""
         return self._access.store.is_complete
 
     @property
     def metadata(self) -> Metadata | None:
-        """Descriptions, units, ranges and bits by name, after :meth:`load_metadata`."""
+        """Descriptions, units, ranges and bits of the parameters, by name. None before :meth:`load_metadata`."""
         return self._metadata
 
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
         """Load the documentation of the parameters from a file.
 
-        This is ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``,
-        which also contains the defaults. Metadata does not restrict writes: a value outside the documented range is
-        set, and its result has a ``note``. Metadata also identifies changes that need a reboot.
+        The file is ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or
+        ``parameters.json``. PX4's files also contain the defaults. Metadata does not restrict writes: a value outside
+        its documented range is set, and the result has a ``note``. Metadata also says which changes need a reboot.
 
         Raises:
             FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
@@ -105,7 +105,7 @@ class Parameters(ReadOnly):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> ParameterTable:
-        """Return all parameters; immediately if they were downloaded since the vehicle started.
+        """Return all parameters. Downloads them first, unless :attr:`is_complete` is True.
 
         Args:
             method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
@@ -194,7 +194,7 @@ class Parameters(ReadOnly):
     ) -> dict[str, ParameterWrite]:
         """Set several parameters concurrently; return a result for each of them. Check the ``error`` of each result.
 
-        Parameters that ArduPilot has only while an ``…_ENABLE`` parameter is set may be set together with it.
+        Some ArduPilot parameters exist only while an ``…_ENABLE`` parameter is set. You can set both in one call.
 
         Raises:
             InvalidArgument: a name or value is invalid. Nothing was set.
@@ -296,7 +296,9 @@ class Parameters(ReadOnly):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> ParameterTable:
-        """Return the parameters that differ from their default, according to MAVFTP or the metadata.
+        """Return the parameters that differ from their defaults.
+
+        The defaults are those that the vehicle has sent by MAVFTP, otherwise those of the loaded metadata.
 
         Raises:
             NotSupported: the defaults are unknown, because neither MAVFTP nor metadata with defaults is available.

@@ -23,7 +23,7 @@ async def read_return_altitude(parameters: Parameters, session: VehicleSession) 
 
 
 def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vtol: bool) -> float | None:
-    """Return the altitude, or None if its parameter is unknown. Requests nothing."""
+    """Return the altitude in metres from a parameter that is already known, or None. Sends nothing."""
     for name, units_per_metre in autopilot.return_altitude_parameters(is_vtol=is_vtol):
         if (known := parameters.known(name)) is not None:
             return round(known.value / units_per_metre, 3)

@@ -74,7 +74,7 @@ class ParameterStore:
         return name in self._known
 
     def set_stale(self, name: str, value: float) -> None:
-        """Ignore messages with the old value for ``STALE_VALUE_S`` seconds after a write."""
+        """For ``STALE_VALUE_S`` seconds, ignore messages with this value, which the parameter had before a write."""
         # ArduPilot answers PARAM_SET at once, but PARAM_REQUEST_READ up to 0.1 s after it read the value. An answer
         # with the old value may therefore arrive after the confirmation of the write. Another station may instead have
         # restored the old value, so the parameter is read after each ignored message.
@@ -85,7 +85,7 @@ class ParameterStore:
         self._stale.pop(name, None)
 
     def stale_value(self, name: str) -> StaleValue | None:
-        """Return the value that is ignored in messages, or None."""
+        """Return the value that `set_stale` has set, or None if there is none or its time is over."""
         stale = self._stale.get(name)
         return stale if stale is not None and self._transfers.connection.now() < stale.ignored_until else None
 
@@ -109,8 +109,8 @@ class ParameterStore:
     def replace(self, table: ParameterTable, *, updates_before: int) -> None:
         """Replace all parameters by a downloaded list.
 
-        ``updates_before`` is the value of ``updates`` when the list was requested. Messages that have arrived after
-        that take precedence over the list.
+        ``updates_before`` is the value of ``updates`` when the list was requested. Messages that arrived later take
+        precedence over the list. If the vehicle has rebooted since, the list is ignored.
         """
         # If the vehicle has rebooted since the request, it may have other values.
         if updates_before < self._forgotten_at:
@@ -169,7 +169,7 @@ CACHE_FORMAT = 1
 
 
 def default_directory() -> Path:
-    """Return ``~/.cache/aerokit/parameters``, or its equivalent on other systems."""
+    """Return the directory of the cache: ``~/.cache/aerokit/parameters``, or its equivalent on other systems."""
     xdg_cache_home = os.environ.get("XDG_CACHE_HOME", "")
     # An absolute path in this variable takes precedence (https://specifications.freedesktop.org/basedir-spec).
     if os.path.isabs(xdg_cache_home):
@@ -199,7 +199,7 @@ class ParameterCache:
             return None  # The file is missing, unreadable or damaged.
 
     def save(self, vehicle: str, hash_: int, table: ParameterTable) -> None:
-        """Replace the cached list of a vehicle atomically. Errors of the disk are ignored."""
+        """Replace the cached list of a vehicle atomically. If the file cannot be written, do nothing."""
         rows = [[param.name, param.value, int(param.type), param.default] for param in table.values()]
         content = {"format": CACHE_FORMAT, "vehicle": vehicle, "hash": hash_, "parameters": rows}
         path = self._path(vehicle)

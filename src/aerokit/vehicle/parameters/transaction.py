@@ -39,13 +39,14 @@ class RestoreRegistry:
         self._blocks: dict[str, list[_Block]] = {}
         self._lock = asyncio.Lock()
         self.restored: dict[str, Parameter] = {}
-        """Parameters that were restored since a block last began to save values."""
+        """Parameters that blocks have restored, by name. Cleared whenever a block saves values."""
 
     @asynccontextmanager
     async def exclusive(self, timeout: float | None = None) -> AsyncIterator[None]:
-        """Run the block when no other block saves or restores values, but after ``timeout`` seconds in any case.
+        """Context manager: wait until no other block saves or restores values, at most ``timeout`` seconds.
 
-        A block that saves a value while another block restores it would save, and later restore, a temporary value.
+        After the time-out it enters anyway. Without this lock, a block might save, and later restore, a temporary value
+        that another block is just replacing.
         """
         with anyio.move_on_after(timeout) as waiting:
             await self._lock.acquire()
@@ -258,7 +259,7 @@ class Transaction(_Block):
 
     @property
     def changes(self) -> tuple[ParameterDifference, ...]:
-        """Parameters that were written so far and have changed, by their names on the vehicle."""
+        """The changes that this transaction has made so far, with the vehicle's names of the parameters."""
         from aerokit.parameters import ParameterDifference
 
         return tuple(
@@ -316,9 +317,10 @@ class Transaction(_Block):
 
 
 def abandon(block: TemporaryParameters | Transaction, error: AerokitError, cause: BaseException | None) -> None:
-    """End a block whose connection has ended with its loop (``error``), and raise what leaving it would raise.
+    """End a block whose event loop has ended, so that it cannot restore parameters.
 
-    ``cause`` is the exception that has left the block, or None.
+    Raises RollbackFailed, with the text of ``error``, if the block would have restored parameters. Raises ``error``
+    itself if the block had already ended. ``cause`` is the exception that has left the block, or None.
     """
     block._abandon(error, cause)
 

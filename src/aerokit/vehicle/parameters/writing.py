@@ -55,7 +55,7 @@ class ResolvedParameter(Snapshot):
 
 
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
-    """Return the known parameter with this name or with another of its names, or None."""
+    """Return the known parameter that has this name in older, present or newer firmware, or None."""
     if name in known:
         return ResolvedParameter(name, known[name], is_fresh=False)
     from aerokit.parameters.renames import resolve_rename
@@ -73,7 +73,10 @@ class NameResolver:
     async def resolve(
         self, names: Iterable[str], idle_timeout_s: float
     ) -> dict[str, ResolvedParameter | ParameterFailure]:
-        """Resolve names, reading parameters that are unknown. Warns of renamed parameters."""
+        """Return the vehicle's parameter, or an error, for each name. Warns if the vehicle uses another name.
+
+        Parameters that are unknown, or whose known value may be outdated, are requested from the vehicle.
+        """
         normalized = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
         store = self._access.store
@@ -165,7 +168,7 @@ class NameResolver:
 
 
 def warn_of_rename(renamed: Renamed) -> None:
-    """Warn at the line of the program that called aerokit."""
+    """Issue a ParameterRenamedWarning that points to the line of the program that called aerokit."""
     from aerokit.parameters.renames import ParameterRenamedWarning
 
     # Frame 1 and `stacklevel` 2 both stand for the caller of this function.
@@ -278,8 +281,8 @@ class ParameterWriter:
     ) -> dict[str, ParameterWrite]:
         """Write the values, and return a result for each.
 
-        ``upload`` is the method by which only changed values are sent. Without it, all values are sent by PARAM_SET.
-        ``resolve`` is called instead of :meth:`NameResolver.resolve`.
+        With ``upload``, only changed values are sent, by this method. Without it, all values are sent by PARAM_SET.
+        ``resolve`` replaces :meth:`NameResolver.resolve`.
         """
         resolve = resolve or self.names.resolve
         results: dict[str, ParameterWrite] = {}
@@ -327,7 +330,10 @@ class ParameterWriter:
         *,
         is_first_round: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
-        """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
+        """Return the planned writes, and the errors by name.
+
+        An invalid value raises InvalidArgument in the first round, and is one of the errors in later rounds.
+        """
         plans: list[_PlannedWrite] = []
         first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
         errors: dict[str, AerokitError] = {}
