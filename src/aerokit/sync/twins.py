@@ -2041,7 +2041,7 @@ class Transaction(TransactionTwin):
 
     @property
     def changes(self) -> tuple[ParameterDifference, ...]:
-        """Parameters that were written so far and have changed, by their names on the vehicle."""
+        """The changes that this transaction has made so far, with the vehicle's names of the parameters."""
         return self.aio.changes
 
     @property
@@ -2072,8 +2072,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     no longer has causes an :class:`aerokit.parameters.ParameterRenamedWarning`, which contains the new name.
 
     ArduPilot handles parameters a few times a second. aerokit raises this rate by SET_MESSAGE_INTERVAL of PARAM_VALUE
-    while it reads more than five parameters, and restores the rate at the end. For unknown names, which the vehicle may
-    not have, it raises the rate after half a second.
+    while it reads more than five parameters, and restores the rate at the end. While it reads fewer parameters that the
+    vehicle may not have, it raises the rate after half a second without an answer.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; then OperationTimeout). You can cancel any call.
@@ -2085,25 +2085,25 @@ class Parameters(TwinOf["AsyncParameters"]):
         return self.aio.table
 
     def known(self, name: str) -> Parameter | None:
-        """Return the last known parameter with this name, like ``table.get(name)`` but without building a table."""
+        """Return the known parameter with this name, or None. Like ``table.get(name)``, but does not build a table."""
         return self.aio.known(name)
 
     @property
     def is_complete(self) -> bool:
-        """True if the whole list was downloaded since the vehicle started."""
+        """True if all parameters were downloaded since the vehicle started, and since the link was last reopened."""
         return self.aio.is_complete
 
     @property
     def metadata(self) -> Metadata | None:
-        """Descriptions, units, ranges and bits by name, after :meth:`load_metadata`."""
+        """Descriptions, units, ranges and bits of the parameters, by name. None before :meth:`load_metadata`."""
         return self.aio.metadata
 
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
         """Load the documentation of the parameters from a file.
 
-        This is ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``,
-        which also contains the defaults. Metadata does not restrict writes: a value outside the documented range is
-        set, and its result has a ``note``. Metadata also identifies changes that need a reboot.
+        The file is ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or
+        ``parameters.json``. PX4's files also contain the defaults. Metadata does not restrict writes: a value outside
+        its documented range is set, and the result has a ``note``. Metadata also says which changes need a reboot.
 
         Raises:
             FileFormatError, OSError: as for :func:`aerokit.parameters.load_metadata`.
@@ -2120,7 +2120,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> ParameterTable:
-        """Return all parameters; immediately if they were downloaded since the vehicle started.
+        """Return all parameters. Downloads them first, unless :attr:`is_complete` is True.
 
         Args:
             method: ``"ftp"`` reads one small file that also has the defaults (``@PARAM/param.pck``), ``"list"``
@@ -2200,7 +2200,7 @@ class Parameters(TwinOf["AsyncParameters"]):
     ) -> dict[str, ParameterWrite]:
         """Set several parameters concurrently; return a result for each of them. Check the ``error`` of each result.
 
-        Parameters that ArduPilot has only while an ``…_ENABLE`` parameter is set may be set together with it.
+        Some ArduPilot parameters exist only while an ``…_ENABLE`` parameter is set. You can set both in one call.
 
         Raises:
             InvalidArgument: a name or value is invalid. Nothing was set.
@@ -2299,7 +2299,9 @@ class Parameters(TwinOf["AsyncParameters"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> ParameterTable:
-        """Return the parameters that differ from their default, according to MAVFTP or the metadata.
+        """Return the parameters that differ from their defaults.
+
+        The defaults are those that the vehicle has sent by MAVFTP, otherwise those of the loaded metadata.
 
         Raises:
             NotSupported: the defaults are unknown, because neither MAVFTP nor metadata with defaults is available.
@@ -4952,7 +4954,7 @@ class Vehicle(VehicleTwin):
     def camera(self) -> Camera:
         """The first camera found with its own component id; if none was found, one attached to the autopilot.
 
-        The calls of this object wait briefly until a camera is found. ``camera_at`` returns any other camera.
+        If no camera was found yet, its methods wait briefly for one. Use :meth:`camera_at` for any other camera.
         """
         return self._part("camera", Camera)
 
@@ -5104,7 +5106,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def calibrate(self) -> CalibrationControl:
-        """Calibrations of sensors, radio and ESCs, step by step."""
+        """Calibration of sensors, radio and ESCs."""
         return self._part("calibrate", CalibrationControl)
 
     @property
@@ -5263,8 +5265,8 @@ def connect(
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …, or a
             link; a list of these, if several links lead to the same vehicle (docs/how-to/several-links.md); or an open
-            connection, to use several vehicles on one link. The arguments after ``rates`` are not allowed with an open
-            connection; pass them to ``open_connection``.
+            connection, to use several vehicles on one link. With an open connection, pass the arguments after
+            ``rates`` to ``open_connection`` instead.
         system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
         timeout: seconds to wait for the vehicle's first heartbeat, above 0.
         rates: rates to request instead of the default ones, as a mapping of message class to Hz (above 0, at most
