@@ -76,7 +76,7 @@ class DirectoryFiles:
     """
 
     def __init__(self, root: Path | None, memory: FileTree, *, is_writable: bool) -> None:
-        self.root = None if root is None else root.resolve(strict=True)
+        self.root: Path | None = None if root is None else root.resolve(strict=True)
         self._memory = memory
         self._is_writable = is_writable
 

@@ -246,7 +246,7 @@ class SettingWrite(Transfer[Setting]):
         elif result == ParamAck.IN_PROGRESS:
             self._progress_at = now
             self._is_writing = True
-            self.deadline = now + min(PROGRESS_TIMEOUT_S, self._idle_timeout_s)
+            self.deadline: float | None = now + min(PROGRESS_TIMEOUT_S, self._idle_timeout_s)
         elif result == ParamAck.ACCEPTED:
             # The accepted value differs from ours: the component adjusted it, or another station set it meanwhile.
             self._read(now)

@@ -39,14 +39,14 @@ class PendingRequest:
     )  # fmt: skip
 
     def __init__(self, now: float, number: int) -> None:
-        self.first_at = now
-        self.sent_at = now
-        self.previous_sent_at = now
-        self.due_at = now
-        self.first_number = number
-        self.last_number = number
-        self.was_duplicated = False
-        self.attempts = 0
+        self.first_at: float = now
+        self.sent_at: float = now
+        self.previous_sent_at: float = now
+        self.due_at: float = now
+        self.first_number: int = number
+        self.last_number: int = number
+        self.was_duplicated: bool = False
+        self.attempts: int = 0
 
 
 class PendingRequests(Generic[KeyT]):

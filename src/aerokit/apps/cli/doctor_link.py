@@ -54,7 +54,7 @@ class BaudRateProbe:
         self.bytes: int = 0
         self.frames: int = 0
         self._framer = Framer()
-        self.ended = asyncio.Event()
+        self.ended: asyncio.Event = asyncio.Event()
         """Set when MAVLink is detected, or the port is lost."""
         self._loop = asyncio.get_running_loop()
         self.error: LinkLost | None = None

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.components.component import Component
+    from aerokit.vehicle.session.session import VehicleSession
 
 # A camera with a component id sends a HEARTBEAT within this time.
 DISCOVERY_TIMEOUT_S = 2.5
@@ -52,8 +53,8 @@ class CameraLink(CameraOrders):
         *,
         on_bound: Callable[[int], None] = lambda _: None,
     ) -> None:
-        self.context = context
-        self.session = context.session
+        self.context: VehicleContext = context
+        self.session: VehicleSession = context.session
         self._component_of = component_of
         # Called with the number of the camera as soon as it is known.
         self._on_bound = on_bound
