@@ -6,19 +6,23 @@ import asyncio
 import math
 from enum import Enum
 from functools import partial
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import pytest
 from flight_harness import block_loop
 from onboard_peers import autopilot_and_client, payload_and_station
 
+import aerokit
 from aerokit.errors import BusyError, CommandRejected, InvalidArgument
+from aerokit.mavlink import Dialect
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavParamType, MavResult, MavType
 from aerokit.missions import MissionItem
 from aerokit.onboard import CommandRequest, CommandResult, Param, Range
 from aerokit.protocols.servers.commands import MAX_RESULTS
+from aerokit.transport import memory_link_pair
 
 pytestmark = pytest.mark.anyio
 
@@ -55,6 +59,44 @@ async def test_command_with_other_values_is_denied(params: tuple[float, ...]) ->
             ack = await station.command(MavCmd.USER_1, *params)
     assert ack.result == MavResult.DENIED
     assert "is not allowed" in texts[0].text
+
+
+OWN_COMMAND_LONG = """<mavlink><messages>
+<message id="0" name="HEARTBEAT"><field type="uint8_t" name="type"/><field type="uint8_t" name="autopilot"/>
+<field type="uint8_t" name="base_mode"/><field type="uint32_t" name="custom_mode"/>
+<field type="uint8_t" name="system_status"/><field type="uint8_t_mavlink_version" name="mavlink_version"/></message>
+<message id="76" name="COMMAND_LONG"><field type="uint8_t" name="target_system"/>
+<field type="uint8_t" name="target_component"/><field type="uint16_t" name="command"/>
+<field type="uint8_t" name="confirmation"/>{params}<extensions/><field type="uint32_t" name="token"/></message>
+<message id="77" name="COMMAND_ACK"><field type="uint16_t" name="command"/><field type="uint8_t" name="result"/>
+<extensions/><field type="uint8_t" name="progress"/><field type="int32_t" name="result_param2"/>
+<field type="uint8_t" name="target_system"/><field type="uint8_t" name="target_component"/></message>
+</messages></mavlink>"""
+
+
+async def test_dialect_with_own_command_long_is_answered(tmp_path: Path) -> None:
+    """The class of a dialect's own COMMAND_LONG is no subclass of the standard class."""
+    path = tmp_path / "own.xml"
+    params = "".join(f'<field type="float" name="param{number}"/>' for number in range(1, 8))
+    path.write_text(OWN_COMMAND_LONG.format(params=params))
+    dialect = Dialect.from_xml(path)
+    own: Any = dialect[m.CommandLong.ID]
+    assert own is not m.CommandLong
+    calls: list[tuple[float, ...]] = []
+    near, far = memory_link_pair()
+    async with (
+        aerokit.component(near, system_id=9, component_id=100, dialect=dialect) as node,
+        aerokit.open_connection(far, dialect=dialect) as connection,
+    ):
+
+        @node.command(MavCmd.USER_1)
+        async def work(request: CommandRequest) -> None:
+            calls.append(request.params)
+
+        with connection.subscribe(m.CommandAck) as acks:
+            connection.send(own(9, 100, MavCmd.USER_1, 0, 1, 2, 3, 4, 5, 6, 7, token=8))
+            ack = await acks.get(timeout=10)
+    assert (ack.result, calls) == (MavResult.ACCEPTED, [(1, 2, 3, 4, 5, 6, 7)])
 
 
 async def test_error_without_text_is_reported_by_its_type(caplog: pytest.LogCaptureFixture) -> None:

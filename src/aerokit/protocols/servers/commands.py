@@ -87,24 +87,31 @@ class CommandDispatcher:
         self._host = host
         self._handlers = handlers
         self._refusal = refusal
-        host.on(CommandLong, self._on_command)
-        host.on(CommandInt, self._on_command)
+        host.on(CommandLong, self._on_long)
+        host.on(CommandInt, self._on_int)
 
-    def _on_command(self, message: CommandLong | CommandInt, channel: Channel) -> None:
-        if isinstance(message, CommandLong):
-            x, y, z, frame = message.param5, message.param6, message.param7, None
-            confirmation = message.confirmation
-        else:
-            x, y, z, frame, confirmation = message.x, message.y, message.z, message.frame, 0
+    def _on_long(self, message: CommandLong, channel: Channel) -> None:
         command = ReceivedCommand(
-            message.command, message.param1, message.param2, message.param3, message.param4, x, y, z, frame=frame,
-            channel=channel, sender=sender_of(message), confirmation=confirmation,
+            command=message.command, param1=message.param1, param2=message.param2, param3=message.param3,
+            param4=message.param4, x=message.param5, y=message.param6, z=message.param7, frame=None, channel=channel,
+            sender=sender_of(message), confirmation=message.confirmation,
         )  # fmt: skip
+        self._execute(command)
+
+    def _on_int(self, message: CommandInt, channel: Channel) -> None:
+        command = ReceivedCommand(
+            command=message.command, param1=message.param1, param2=message.param2, param3=message.param3,
+            param4=message.param4, x=message.x, y=message.y, z=message.z, frame=message.frame, channel=channel,
+            sender=sender_of(message),
+        )  # fmt: skip
+        self._execute(command)
+
+    def _execute(self, command: ReceivedCommand) -> None:
         refusal = self._refusal(command)
-        if refusal is None:
-            self.dispatch(command)
-        else:
+        if refusal is not None:
             self.answer(command, refusal)
+            return
+        self.dispatch(command)
 
     def dispatch(self, command: ReceivedCommand) -> None:
         """Call the command's handler, and send its result as acknowledgement.
