@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
@@ -56,6 +56,10 @@ FINAL_ITEM_MAX_AGE_S = 3.0
 STALE_STATE_S = 3.0
 # Every MISSION_CURRENT is compared with these members. Python 3.11 takes 0.3 µs to look up one.
 _ACTIVE, _COMPLETE = MissionState.ACTIVE, MissionState.COMPLETE
+
+
+# The message repeats the same values, and comparing one object with itself is faster than comparing two equal ones.
+_mission_progress = lru_cache(maxsize=4)(MissionProgress)
 
 
 class PlanCache:
@@ -186,7 +190,7 @@ class PlanContext:
         return received.is_set()
 
     def _on_current(self, frame: Frame) -> None:
-        if self.session.telemetry.accepts(frame):
+        if frame.component_id == self.session.component_id:
             self._current = frame
 
     def _on_ack(self, ack: MissionAck) -> None:
@@ -323,9 +327,10 @@ class MissionTracker:
             self.count.set(0, self._source)
         elif reported.total is not None:
             self.count.set(reported.total, self._source)
-        self.progress.set(MissionProgress(current, self.count.latest, reported.state), self._source)
+        count = self.count.latest
+        self.progress.set(_mission_progress(current, count, reported.state), self._source)
         self.current.set(current, self._source)
-        if current is not None and current == self.last_item:
+        if current is not None and current + 1 == count:  # The current item is the last one.
             self._last_item_current_at = self._session.connection.now()
         if current != before:
             self._detect_second_approach(before, current)
