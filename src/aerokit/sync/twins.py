@@ -1359,14 +1359,15 @@ class Files(TwinOf["AsyncFiles"]):
 
     Paths are the vehicle's: ``/APM/LOGS`` and ``@PARAM/param.pck`` on ArduPilot, ``/fs/microsd/log`` on PX4.
 
-    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). For a resumed download, ``timeout`` limits each step: reading, comparing the CRC-32, and
-    reading again. You can cancel any call; the file is then closed on the vehicle.
+    All methods but ``is_supported`` take ``idle_timeout_s`` (fail after this many seconds without progress) and
+    ``timeout`` (seconds in total, including the wait for earlier operations; None for no limit). For a resumed
+    download, ``timeout`` limits each step: reading, comparing the CRC-32, and reading again. ``on_progress`` is called
+    with the progress in bytes. You can cancel any call; the file is then closed on the vehicle.
 
     Every method but ``is_supported`` raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; see ``code`` and ``errno``.
-        FileTimeout: the operation did not finish; ``missing`` has the missing ranges.
+        FileTimeout: the operation did not finish; ``missing`` has the missing ranges as (offset, size) in bytes.
     """
 
     def is_supported(self) -> bool:
@@ -1403,12 +1404,12 @@ class Files(TwinOf["AsyncFiles"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
+        """Copy a file to this computer. The copy is written to ``<to>.part`` and replaces ``to`` when it is complete.
 
-        With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than the part. After a resumed download, aerokit compares the CRC-32 of both files, if the vehicle
-        can compute it. If they differ, the whole file is read again. Files whose names begin with ``@`` are always read
-        completely.
+        An interrupted download leaves ``<to>.part`` for a later one. With ``resume``, the download continues this file,
+        unless the vehicle's file is shorter. After a resumed download, aerokit compares the CRC-32 of both files, if
+        the vehicle can compute it. If they differ, the whole file is read again. Files whose names begin with ``@`` are
+        always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -1524,7 +1525,7 @@ class Files(TwinOf["AsyncFiles"]):
     def rename(
         self, path: str, new_path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> None:
-        """Rename or move a file or directory; both paths together must fit into one message."""
+        """Rename or move a file or directory. Both paths together may have at most 237 bytes (one message)."""
         self._loop.run(self.aio.rename, path, new_path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
@@ -1533,6 +1534,8 @@ class LogStream(LogStreamTwin):
 
     If you append all bytes to a file, the file is a valid ULog file at any time. Lost messages are marked in the log as
     dropouts; ``lost`` counts them. PX4 streams its log to one station at a time.
+
+    The iterator has no end: leave the loop by ``break``, or cancel the task. Leaving the block stops the stream.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot. Nothing was sent.
@@ -1549,9 +1552,9 @@ class LogStream(LogStreamTwin):
 class Logs(TwinOf["AsyncLogs"]):
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
-    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
-    it. You can cancel any call; the vehicle then stops sending.
+    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and, except ``stream``,
+    ``timeout`` (seconds in total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step:
+    finding the log, and reading it. You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed. When such a message requests a log, ArduPilot ends the log
     that it is writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its
@@ -1595,8 +1598,10 @@ class Logs(TwinOf["AsyncLogs"]):
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
-            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
+            FileError: there is no such log, the logs have changed since :meth:`list`, or ``method`` is ``"ftp"`` and
+                the file of the log cannot be identified.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges as (offset, size) in
+                bytes.
             OSError: the local file cannot be written, or another download of this program is writing it.
         """
         self._loop.run(
@@ -1623,8 +1628,10 @@ class Logs(TwinOf["AsyncLogs"]):
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
-            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
+            FileError: there is no such log, the logs have changed since :meth:`list`, or ``method`` is ``"ftp"`` and
+                the file of the log cannot be identified.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges as (offset, size) in
+                bytes.
         """
         return self._loop.run(
             self.aio.read, log, method=method, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress
@@ -2444,7 +2451,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total.
+            timeout: seconds in total, including the wait until other transfers have ended; None for no limit.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
@@ -2456,7 +2463,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
-            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it; or a fence or rally points were
+                to be transferred over MAVLink 1, which has only missions.
             FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
@@ -2487,7 +2495,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             MissionRejected: the vehicle refused.
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
-            NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
+            NotSupported, FileError, FileTimeout: as for :meth:`upload`.
             OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
@@ -2495,11 +2503,11 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
+        """Remove all items of the plan from the vehicle, and verify that it has none. Arguments as for :meth:`upload`.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            MissionRejected: the vehicle refused.
+            MissionRejected: the vehicle refused. ArduPilot refuses to clear a mission that it is flying.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: the transfer was not done within ``timeout``.
@@ -2508,7 +2516,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
     @cached_property
     def current(self) -> StateCell[int | None]:
-        """Current item (MISSION_CURRENT); None before the start of the mission, and without a mission."""
+        """Number of the current item (MISSION_CURRENT).
+
+        None without a mission, and while ArduPilot reports home as its current item, as it does before the start.
+        """
         return StateCell(self._loop, self.aio.current)
 
     @cached_property
@@ -2523,7 +2534,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
     @property
     def reached(self) -> int | None:
-        """The last item that was reached (MISSION_ITEM_REACHED); None before the first item was reached."""
+        """Number of the item that was reached last (MISSION_ITEM_REACHED), even if the mission has started again since.
+
+        None if no item was reached since the program connected or the vehicle rebooted.
+        """
         return self.aio.reached
 
     def set_current(self, item: int, *, timeout: float = 5.0) -> None:
@@ -2544,8 +2558,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-            OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
-                fell silent before the item was sent.
+            OperationTimeout: the vehicle did not acknowledge the command. With MISSION_SET_CURRENT: a running transfer
+                did not end, MISSION_CURRENT did not confirm the item, or the vehicle fell silent before it was sent.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)
 
@@ -2559,12 +2573,17 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         ArduPilot gets MISSION_START, because a mode change alone does not make it take off. Other autopilots get a mode
         change.
 
+        Args:
+            item: number of the first item to fly.
+            timeout: seconds for each step: to make ``item`` the current item (as in :meth:`set_current`), and to enter
+                the mission mode.
+
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: the vehicle is not armed, its mode changed meanwhile, or no item is left to fly (PX4).
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
-                was busy with a transfer of plans.
+            OperationTimeout: the vehicle did not acknowledge a command, accepted it but stayed in another mode, did not
+                confirm the item, or was busy with a transfer of plans.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._loop.run(self.aio.start, item, timeout=timeout)
@@ -2584,13 +2603,17 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.resume, timeout=timeout)
 
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
+        """Wait until the mission has been flown to its end.
+
+        If the last item is a landing, or a return that ends with a landing (copters), this includes the landing. If it
+        is a return without a landing (planes, rovers), the vehicle must be at home; after five minutes of returning, it
+        may also be elsewhere, e.g. at a rally point.
 
         A :meth:`pause` by another task does not end the wait, but a pilot who then changes the mode does. Cancelling
         this call does not stop the vehicle, and no command is sent when it fails.
 
-        aerokit knows from an upload or a download whether the mission ends with a landing. Otherwise, or after another
-        station has replaced the mission, the mode after the completion shows whether the vehicle lands.
+        aerokit knows the last item from an upload or a download. Otherwise, or after another station has replaced the
+        mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
         items and the mission id (PX4 1.15 and later). On a shared link, the vehicle's answer to the other station also
@@ -2652,7 +2675,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total.
+            timeout: seconds in total, including the wait until other transfers have ended; None for no limit.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
@@ -2664,7 +2687,8 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
-            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it; or a fence or rally points were
+                to be transferred over MAVLink 1, which has only missions.
             FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
@@ -2695,7 +2719,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             MissionRejected: the vehicle refused.
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
-            NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
+            NotSupported, FileError, FileTimeout: as for :meth:`upload`.
             OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
@@ -2703,11 +2727,11 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
+        """Remove all items of the plan from the vehicle, and verify that it has none. Arguments as for :meth:`upload`.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            MissionRejected: the vehicle refused.
+            MissionRejected: the vehicle refused. ArduPilot refuses to clear a mission that it is flying.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: the transfer was not done within ``timeout``.
@@ -2729,7 +2753,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
 class RallyControl(TwinOf["AsyncRallyControl"]):
     """Rally points, where a vehicle may return instead of home: ``await vehicle.rally.upload(RallyPoints([...]))``.
 
-    PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
+    PX4 calls them safe points, and ignores them if its parameter RTL_TYPE is 2 or 4 (return along the mission).
     """
 
     def upload(
@@ -2757,7 +2781,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total.
+            timeout: seconds in total, including the wait until other transfers have ended; None for no limit.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
@@ -2769,7 +2793,8 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
-            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it; or a fence or rally points were
+                to be transferred over MAVLink 1, which has only missions.
             FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
@@ -2800,7 +2825,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             MissionRejected: the vehicle refused.
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
-            NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
+            NotSupported, FileError, FileTimeout: as for :meth:`upload`.
             OperationTimeout: the transfer was not complete within ``timeout``.
         """
         return self._loop.run(
@@ -2808,11 +2833,11 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
+        """Remove all items of the plan from the vehicle, and verify that it has none. Arguments as for :meth:`upload`.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            MissionRejected: the vehicle refused.
+            MissionRejected: the vehicle refused. ArduPilot refuses to clear a mission that it is flying.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: the transfer was not done within ``timeout``.
