@@ -5222,7 +5222,8 @@ def open_connection(
             when the others fail. A lost link is reopened while another link works.
         source_system: own system id, 1–255; ground stations use 255.
         source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
-        baud: bits per second of a serial link whose address does not give them, above 0.
+        baud: bits per second of a serial link whose address does not give them, above 0. Not allowed if only
+            link objects are given.
         dialect: the messages that are decoded.
         mavlink_version: version of sent messages, 1 or 2; both are received.
         signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
@@ -5292,15 +5293,15 @@ def connect(
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …, or a
             link; a list of these, if several links lead to the same vehicle (docs/how-to/several-links.md); or an open
-            connection, to use several vehicles on one link. With an open connection, pass the arguments after
-            ``rates`` to ``open_connection`` instead.
+            connection, to use several vehicles on one link. With an open connection, the arguments after ``rates``
+            are not allowed: pass them to ``open_connection``.
         system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
         timeout: seconds to wait for the vehicle's first heartbeat, above 0.
         rates: rates to request instead of the default ones, as a mapping of message class to Hz (above 0, at most
             1000). ``{}`` requests nothing.
         source_system: our own system id.
         source_component: our own component id, 0–255. 0 is not a valid component id, but some old programs use it.
-        baud: baud rate of a serial link whose address has none.
+        baud: baud rate of a serial link whose address has none. Not allowed if only link objects are given.
         dialect: the message definitions to use.
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
