@@ -19,6 +19,7 @@ from aerokit.mavlink.dialect import Dialect
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavType
 from aerokit.mavlink.messages import Attitude, Heartbeat, RequestDataStream
+from aerokit.mavlink.signing import Signing, SigningKey
 from aerokit.sim import ExtraComponent, SimulatedCopter, simulated_link
 from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
@@ -189,6 +190,45 @@ async def test_wrong_arguments_are_refused_before_opening(arguments: dict[str, A
     assert record.read_bytes() == b"precious"
     await near.open(FarEnd())  # it was not opened before
     near.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "instead"),
+    [
+        ({"source_system": 42}, "pass source_system to open_connection"),
+        ({"source_component": 1}, "pass source_component to open_connection"),
+        ({"baud": 115200}, "pass baud to open_connection"),
+        ({"dialect": Dialect("mine", [Heartbeat])}, "pass dialect to open_connection"),
+        ({"mavlink_version": 1}, "set connection.mavlink_version"),
+        ({"record": "flight.tlog"}, "use connection.record"),
+        ({"signing": Signing(SigningKey(bytes(range(32))))}, "set connection.signing"),
+        ({"reconnect": True}, "pass reconnect to open_connection"),
+        ({"peers": "10.0.0.7"}, "pass them to open_connection"),
+        ({"may_move": True}, "pass them to open_connection"),
+        ({"heartbeat": None}, "pass heartbeat to open_connection"),
+        ({"share": ["tcpin:127.0.0.1:0"]}, "use aerokit.hub.shared"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
+)
+async def test_open_connection_refuses_arguments_of_link(arguments: dict[str, Any], instead: str) -> None:
+    (name,) = arguments
+    async with simulated_link(SimulatedCopter()) as link, open_connection(link) as connection:
+        with pytest.raises(InvalidArgument, match=rf"\b{name}\b.* not allowed here: .* {instead}"):
+            async with connect(connection, **arguments):
+                pytest.fail("the argument has no effect")
+        assert not connection.attached
+        async with connect(connection) as vehicle:  # The connection is as before.
+            assert vehicle.system_id == 1
+
+
+@pytest.mark.parametrize("count", [1, 2])
+async def test_link_objects_refuse_baud(count: int) -> None:
+    links = [memory_link_pair()[0] for _ in range(count)]
+    with pytest.raises(InvalidArgument, match="baud = 115200 is not allowed with a link object"):
+        async with open_connection(links, baud=115200):
+            pytest.fail("nothing is opened")
+    await links[0].open(FarEnd())  # it was not opened before
+    links[0].close()
 
 
 async def test_wrong_address_shows_the_accepted_forms() -> None:

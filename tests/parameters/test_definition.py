@@ -107,8 +107,8 @@ def test_range_applies_under_its_condition() -> None:
     assert len(CAMERA.options("CAM_ISO", {"CAM_MODE": 1})) == 5
     assert [option.name for option in CAMERA.options("CAM_ISO", VIDEO_BY_HAND)] == ["100", "200", "400"]
     text = refusal(CAMERA, "CAM_ISO", 800, CAM_MODE=1, CAM_EXPMODE=1)
-    assert (
-        text == "CAM_ISO = 800 is not allowed while CAM_MODE = Video: it must be '100' (100), '200' (200), '400' (400)"
+    assert text == (
+        "CAM_ISO = 800 is not allowed while CAM_MODE = Video: it must be one of '100' (100), '200' (200), '400' (400)"
     )
     assert "1/30" in refusal(CAMERA, "CAM_SHUTTER", "1/30", **VIDEO_BY_HAND)
     assert len(CAMERA.options("CAM_SHUTTER", {**VIDEO_BY_HAND, "CAM_MODE": 0})) == 4
@@ -196,7 +196,7 @@ def test_definition_accepts_value(name: str, value: object, sent: object) -> Non
 @pytest.mark.parametrize(
     ("name", "value", "complaint"),
     [
-        ("CAM_WBMODE", 3, r"CAM_WBMODE = 3 is not allowed: it must be 'Auto' \(0\), 'Sunny' \(4\), 'Cloudy' \(5\)"),
+        ("CAM_WBMODE", 3, r"= 3 is not allowed: it must be one of 'Auto' \(0\), 'Sunny' \(4\), 'Cloudy' \(5\)"),
         ("CAM_WBMODE", "sunny", r"did you mean 'Sunny'\?"),
         ("CAM_OFFSET", 70000, r"-32768\.\.32767"),
         ("CAM_EV", 3.1, r"CAM_EV = 3\.1 is not allowed: it must be -3\.\.3"),

@@ -76,7 +76,10 @@ class Bus:
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
-        """Deliver every ``message_type`` of ``system_id`` (0: of every system) to ``sink``."""
+        """Deliver every message of this type from ``system_id`` (0: from any system) to ``sink``.
+
+        Returns a function that detaches ``sink``.
+        """
         return self._attach((system_id, message_type.ID), _Entry(MESSAGE, sink))
 
     def require_frames(self, *message_types: type[Message]) -> None:
@@ -95,7 +98,10 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Call ``sink(frame)``, or ``sink(frame, message)`` if another sink needs the message decoded anyway."""
+        """Like :meth:`attach`, but call ``sink(frame)`` with the undecoded frame.
+
+        If another sink needs the message decoded anyway, call ``sink(frame, message)`` instead.
+        """
         return self._attach((system_id, message_type.ID), _Entry(LAZY, sink))
 
     def create_on_first(
@@ -129,7 +135,7 @@ class Bus:
         return detach_all
 
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
-        """Deliver every event of this class and of its subclasses to ``sink``."""
+        """Deliver every event of this class and of its subclasses to ``sink``. Returns a function that detaches it."""
         self._event_sinks[event_type] = (*self._event_sinks.get(event_type, ()), sink)
         return once(lambda: _remove_sink(self._event_sinks, event_type, sink))
 

@@ -368,9 +368,10 @@ class Connection:
         return self._clock()
 
     def _slept_since(self, at: float) -> float:
-        """Return for how many seconds since ``at`` the computer was suspended.
+        """Return for how many seconds the computer was suspended after ``at``, a time on the clock of :meth:`now`.
 
-        The call may publish :class:`ComputerSlept`, whose subscribers correct all ages.
+        This clock stands still meanwhile. If the suspension was not noticed before, the call publishes
+        :class:`ComputerSlept`, and the vehicles add the suspension to the age of all their values before it returns.
         """
         return self._receiver.slept_since(at)
 

@@ -75,7 +75,10 @@ class LoopWatch:
         # The largest of three readings is used, because a single reading may be too small; see `_detect_sleep`.
         self._suspended_before = max(suspended() for _ in range(3))  # seconds of suspension at the last check
         self.late_after: float = math.inf
-        """Data that is read before this loop time has not waited. For later reads, call :meth:`arrival_time`."""
+        """Loop time until which the time of reading is the receive time. Later reads must call :meth:`arrival_time`.
+
+        Infinite before `start` and after `close`. Minus infinity while data from a pause may still be unread.
+        """
         self._ran_at = self._loop.time()  # when the loop last ran, as far as known
         self._due = self._ran_at  # when the timer should fire
         self._timer: asyncio.TimerHandle | None = None  # None before start() and after close()

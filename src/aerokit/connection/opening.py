@@ -39,6 +39,9 @@ ground station with that id has gone.
 """
 
 
+DEFAULT_BAUD = 57600
+"""Default of the argument ``baud``. Any other value was given by the caller."""
+
 PEERS_WITH_LINK_OBJECT = (
     "peers = … is not allowed with a link object: pass an address, or pass them to UdpListen or TcpListen"
 )
@@ -73,7 +76,8 @@ async def open_connection(
             when the others fail. A lost link is reopened while another link works.
         source_system: own system id, 1–255; ground stations use 255.
         source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
-        baud: bits per second of a serial link whose address does not give them, above 0.
+        baud: bits per second of a serial link whose address does not give them, above 0. Not allowed if only
+            link objects are given.
         dialect: the messages that are decoded.
         mavlink_version: version of sent messages, 1 or 2; both are received.
         signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
@@ -148,7 +152,16 @@ def _create_link(
         )
     if peers is not None:
         raise InvalidArgument(PEERS_WITH_LINK_OBJECT)
+    _check_that_baud_applies(baud)
     return address
+
+
+def _check_that_baud_applies(baud: int) -> None:
+    """Raise InvalidArgument if the caller gave a baud rate, because only link objects were given with it."""
+    if baud != DEFAULT_BAUD:
+        raise InvalidArgument(
+            f"baud = {baud} is not allowed with a link object: pass an address, or pass baud to SerialLink"
+        )
 
 
 def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
@@ -166,6 +179,8 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
     _check_distinct(addresses, targets)
     if peers is not None:
         _check_that_peers_apply(targets)
+    if all(isinstance(target, Link) for target in targets):
+        _check_that_baud_applies(baud)
     factories = list(map(partial(_link_factory, baud=baud, peers=peers), addresses, targets))
     costly = {
         index for index, target in enumerate(targets) if not isinstance(target, Link) and target.option("costly") == "1"

@@ -73,12 +73,18 @@ class OtherPeer:
 
     @property
     def is_same_sender(self) -> bool | None:
-        """True if it is the sender of the route under a new address; False for another sender; None if unknown."""
+        """True if this peer is the component of the route at a new address, False if it is another sender.
+
+        None while the recorded sequence numbers and times since boot do not show which of the two it is.
+        """
         return False if self._sequence_matches is False else self._clock_matches
 
     def has_replaced_route_peer(self, now: float, frames_per_s: float) -> bool:
-        """Return True if the sender of the route, which sends ``frames_per_s``, has moved to this peer."""
-        # In the time in which the sender usually sends three frames, it has sent none from its old address.
+        """Return True if the component of the route has moved: it sends from this peer, and no longer from its old one.
+
+        ``frames_per_s`` is the rate at which the component sent from the route's peer.
+        """
+        # In the time in which the component usually sends three frames, it has sent none from its old address.
         return (
             self.is_same_sender is True
             and self._frames >= MIN_TAKEOVER_FRAMES
@@ -263,7 +269,7 @@ class Routes:
         return evicted
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
-        """Return the peers that send as the autopilot although its route leads to another peer."""
+        """Return the peers of second autopilots with this system id, as reported by DuplicateSender."""
         autopilot = system_id, MavComponent.AUTOPILOT1
         return {
             peer

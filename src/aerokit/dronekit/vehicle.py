@@ -147,9 +147,10 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     @OverridableProperty
     def sync(self) -> sync.Vehicle:
-        """The blocking API (:class:`aerokit.sync.Vehicle`) on the same connection.
+        """This vehicle as an :class:`aerokit.sync.Vehicle`, aerokit's blocking API, on the same connection.
 
-        Programs can move to this API function by function: ``vehicle.sync.take_off(10)`` returns at altitude. Raises
+        A program can use both APIs side by side, and so move to the blocking API one call at a time. For example, use
+        ``vehicle.sync.take_off(10)`` in place of ``vehicle.simple_takeoff(10)``: it returns at that altitude. Raises
         APIException before the vehicle is connected.
         """
         if self._dk_context is None:

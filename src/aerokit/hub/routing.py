@@ -305,7 +305,8 @@ class Router(Generic[PortT]):
         else:
             # A port that was added after the earlier frame arrived cannot have returned it.
             may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S
-            # A copy over the sender's second link may be what creates that link's port.
+            # The frame may be a copy nevertheless: if the sender transmits every frame over two links, the first copy
+            # over the second link is what adds that link's port (a new UDP peer), right after the earlier frame.
             max_age_s = DUPLICATE_WINDOW_S if may_be_echo else NEW_PORT_WINDOW_S
             is_copy = first_port in self._ingresses and age_s <= max_age_s
         if is_copy:

@@ -26,7 +26,7 @@ _MAX_DURATION_S = 86_400.0 * 365
 
 def _number_of(name: str, choice: str, numbers: Mapping[str, float]) -> float:
     if choice not in numbers:
-        raise InvalidArgument(f"{name} = {choice!r} is not allowed: it must be {', '.join(map(repr, numbers))}")
+        raise InvalidArgument(f"{name} = {choice!r} is not allowed: it must be one of {', '.join(map(repr, numbers))}")
     return float(numbers[choice])
 
 

@@ -200,7 +200,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a text")
         if metadata.values and checked not in metadata.values:
             raise InvalidArgument(
-                f"{name} = {checked} is not allowed: it must be {', '.join(map(str, metadata.values))}"
+                f"{name} = {checked} is not allowed: it must be one of {', '.join(map(str, metadata.values))}"
             )
         # Leave out two checks of `problem`. The allowed values were checked above, and this program may change
         # read-only parameters.

@@ -267,7 +267,8 @@ def _check_option(
     shown = list(by_name.items())[:MAX_SHOWN_OPTIONS]
     names = ", ".join(f"{name!r} ({short_repr(option_value)})" for name, option_value in shown)
     more = f" and {len(by_name) - MAX_SHOWN_OPTIONS} more" if len(by_name) > MAX_SHOWN_OPTIONS else ""
-    allowed = f"it must be {names}{more}" if names else "no value is allowed"
+    one_of = "one of " if len(by_name) > 1 else ""
+    allowed = f"it must be {one_of}{names}{more}" if names else "no value is allowed"
     raise InvalidArgument(
         f"{setting.name} = {short_repr(value)} is not allowed{restriction}: {allowed}" + did_you_mean(value, by_name)
     )

@@ -111,7 +111,7 @@ RENAMED_IN_4_7: tuple[tuple[tuple[str, ...], int, str], ...] = (
 
 INVERTED = frozenset({"ARMING_CHECK"})
 
-# Parameters whose new names in version 4.7.0 differ from those in 4.7.1.
+# Maps names of version 4.7.1 to the names that these parameters have in 4.7.0 only.
 OTHER_NEW_NAMES: dict[str, tuple[str, ...]] = dict(
     chain.from_iterable(
         ((f"{prefix}NE_JERK", (f"{prefix}JERK_NE",)), (f"{prefix}D_JERK", (f"{prefix}JERK_D",)))

@@ -342,7 +342,10 @@ class VehicleTwin(OpenedTwin["Vehicle"]):
     _opened_by = "connect"
 
     def _part(self, name: str, twin: Callable[[LoopThread, Any], T]) -> T:
-        """Return the twin of a sub-object, such as ``parameters``, created on the loop thread on first access."""
+        """Return the blocking twin of an attribute of the vehicle, such as ``parameters``.
+
+        The first access reads the attribute on the loop's thread; the twin is then stored.
+        """
         # No lock is used, because code on the loop's thread reads parts, too, and must not wait. If two threads create
         # a part at the same time, setdefault() keeps one of them.
         key = f"_part_{name}"

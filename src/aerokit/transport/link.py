@@ -63,7 +63,7 @@ class PeerKeeper(Receiver, Protocol):
     """
 
     keeps_peers: bool
-    """If True, the link writes to kept peers only, and never forgets a kept peer by itself."""
+    """True if the receiver chooses the peers that the link remembers. If False, the link chooses them itself."""
 
 
 @runtime_checkable

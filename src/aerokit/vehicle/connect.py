@@ -15,7 +15,7 @@ from aerokit._internal.async_block import async_block
 from aerokit.connection.bus import EVERY_SYSTEM, copy_exception
 from aerokit.connection.connection import Connection
 from aerokit.connection.heartbeats import OwnHeartbeat, is_autopilot
-from aerokit.connection.opening import explain_no_vehicle, open_connection
+from aerokit.connection.opening import DEFAULT_BAUD, explain_no_vehicle, open_connection
 from aerokit.connection.routes import MAX_ROUTES
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import AerokitError, BusyError, ConnectFailed, InvalidArgument
@@ -80,15 +80,15 @@ async def connect(
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …, or a
             link; a list of these, if several links lead to the same vehicle (docs/how-to/several-links.md); or an open
-            connection, to use several vehicles on one link. With an open connection, pass the arguments after
-            ``rates`` to ``open_connection`` instead.
+            connection, to use several vehicles on one link. With an open connection, the arguments after ``rates``
+            are not allowed: pass them to ``open_connection``.
         system_id: the vehicle's MAVLink system id, 1–255; None means the first autopilot found.
         timeout: seconds to wait for the vehicle's first heartbeat, above 0.
         rates: rates to request instead of the default ones, as a mapping of message class to Hz (above 0, at most
             1000). ``{}`` requests nothing.
         source_system: our own system id.
         source_component: our own component id, 0–255. 0 is not a valid component id, but some old programs use it.
-        baud: baud rate of a serial link whose address has none.
+        baud: baud rate of a serial link whose address has none. Not allowed if only link objects are given.
         dialect: the message definitions to use.
         mavlink_version: version of the frames we send, 1 or 2.
         signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
@@ -119,6 +119,15 @@ async def connect(
     _check_arguments(system_id, timeout, rates, used_dialect)
     if isinstance(address, Connection):
         for is_given, arguments, instead in (
+            (source_system != 255, f"source_system = {source_system} is", "pass source_system to open_connection"),
+            (
+                source_component != MavComponent.MISSIONPLANNER,
+                f"source_component = {source_component} is",
+                "pass source_component to open_connection",
+            ),
+            (baud != DEFAULT_BAUD, f"baud = {baud} is", "pass baud to open_connection"),
+            (dialect is not STANDARD, f"dialect = {dialect.name!r} is", "pass dialect to open_connection"),
+            (mavlink_version != 2, f"mavlink_version = {mavlink_version} is", "set connection.mavlink_version"),
             (record is not None, "record = … is", "use connection.record(…)"),
             (signing is not None, "signing = … is", "set connection.signing"),
             (reconnect, "reconnect = True is", "pass reconnect to open_connection"),

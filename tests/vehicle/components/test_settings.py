@@ -344,7 +344,7 @@ async def test_disallowed_values_are_refused() -> None:
         await settings.download()
         shelf.sent.clear()
         for name, value, complaint in (
-            ("CAM_WBMODE", "Snowy", r"CAM_WBMODE = 'Snowy' is not allowed: it must be 'Auto' \(0\), 'Sunny' \(4\)"),
+            ("CAM_WBMODE", "Snowy", r"'Snowy' is not allowed: it must be one of 'Auto' \(0\), 'Sunny' \(4\)"),
             ("CAM_EV", 4, r"CAM_EV = 4 is not allowed: it must be -3\.\.3"),
             ("CAM_LENS", "other", "CAM_LENS = 'other' is not allowed: it can only be read"),
             ("CAM_ISO", 100, "CAM_ISO = 100 is not allowed now: the setting is excluded by CAM_EXPMODE = Auto"),
@@ -399,7 +399,7 @@ async def test_options_depend_on_other_settings() -> None:
         await shelf.component.command(MavCmd.SET_CAMERA_MODE, 0, CameraMode.VIDEO)
         assert list(settings.options("CAM_ISO")) == ["100", "200", "400"]
         with pytest.raises(
-            InvalidArgument, match=r"CAM_ISO = 800 is not allowed while CAM_MODE = Video: it must be '100'"
+            InvalidArgument, match=r"CAM_ISO = 800 is not allowed while CAM_MODE = Video: it must be one of '100'"
         ):
             await settings.set("CAM_ISO", 800)
         await settings.set("CAM_MODE", "Photo")

@@ -36,7 +36,7 @@ class ReceivedFrame:
         self.at: float = at
         """Receive time of the first copy."""
         self.count: int = count
-        """Number of frames received from the sender until then, this one included."""
+        """Number of frames received from the sender up to and including this one. Copies are not counted."""
         self.is_admitted: bool = False
         """True if a copy has passed the signature check."""
         self.is_delivered: bool = False
@@ -141,7 +141,11 @@ class _Stream:
         return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
 
     def count_acknowledgement(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement. Return True if another link delivered it at least as often as this link."""
+        """Count the arrival of an acknowledgement. Return True if it repeats one that arrived over another link.
+
+        The n-th arrival over this link is a repetition if an equal acknowledgement has arrived over another link at
+        least n times since the last switch.
+        """
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for index, count in enumerate(counts) if index != link)

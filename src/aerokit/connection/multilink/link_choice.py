@@ -275,7 +275,10 @@ class LinkChoice:
         return self.used in (None, candidate) or candidate.is_same_vehicle is True or not self.has_autopilot
 
     def carries_same_stream(self, candidate: Candidate, now: float) -> bool:
-        """Return True if the link carries the same frames as the link in use or, if it is that link, as another."""
+        """Return True if equal frames have recently arrived over this link and over the link in use.
+
+        If ``candidate`` is the link in use, return True if equal frames have recently arrived over it and another link.
+        """
         return now - candidate.copied_at <= SAME_STREAM_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:

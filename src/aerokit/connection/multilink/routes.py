@@ -218,9 +218,10 @@ class MultiLinkRoutes:
     # -------------------------------------------------------------------- received frames
 
     def is_duplicate(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
-        """Return True if this frame was already delivered over another link, or has our own ids.
+        """Return True if the frame must be dropped: it was delivered over another link, or has our own ids.
 
-        With ``is_other_peer``, our messages to its sender go to another peer of this link (`arrived_on_other_peer`).
+        A dropped copy still shows that its link works, and to which vehicle it leads. ``is_other_peer`` is True if the
+        route of the frame's sender leads to another peer of this link (see `arrived_on_other_peer`).
         """
         # PX4 forwards our heartbeats from one of its ports to the others, so they come back over another link.
         if (frame.system_id, frame.component_id) == self._own_source:
@@ -228,7 +229,7 @@ class MultiLinkRoutes:
         link = _link_index(peer)
         if not self._merged.is_duplicate(frame, link, is_other_peer=is_other_peer):
             return False
-        if is_other_peer:  # Our messages go to another peer, so the copy is no evidence about this link.
+        if is_other_peer:  # The copy may come from a second sender with the same ids, so it proves nothing.
             return True
         # The copy is dropped, but it proves that this link works, and shows to which vehicle the link leads.
         self._probes.record_hardware(frame, link)

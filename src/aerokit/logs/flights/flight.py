@@ -286,7 +286,10 @@ class FlightLog:
         return str(item.number - 1) if item.number else "home"
 
     def mode_spans(self) -> list[tuple[ModeChange, float]]:
-        """Return each mode change, with the time at which the mode ends."""
+        """Return a pair for each mode of the flight: its mode change, and the time in seconds at which the mode ends.
+
+        The last mode ends at ``duration_s``.
+        """
         ends = [change.time_s for change in self.modes[1:]] + [self.duration_s]
         return list(zip(self.modes, ends))  # noqa: B905 - without modes, there is one end too many
 

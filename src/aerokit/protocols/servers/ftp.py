@@ -134,7 +134,8 @@ class SessionFtpServer(Generic[FilesT]):
         """Return True if the request repeats the client's latest request, and ``reply`` answers that request."""
         # Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0.
         is_same = client.request is not None and request.repeats(client.request)
-        # The last reply of a burst has a higher number, so a repeated burst request starts the burst again.
+        # Each reply of a burst has the number of the reply before it plus one, and `reply` is the last one. Only the
+        # first reply has the number that is compared here. A repeated burst request therefore starts the burst again.
         reply_sequence = (request.sequence + 1) & 0xFFFF
         return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 

@@ -57,9 +57,9 @@ class _Sensors:
     working: int
     """Bits that are present, enabled and healthy from power-on."""
     control: int = _ALL_CONTROL
-    """Bits of the kinds of control that the firmware supports, such as MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL."""
+    """Bits of the controllers that the firmware has, such as MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL."""
     always: int = 0
-    """Bits of the kinds of control that are enabled in every mode."""
+    """Bits of the controllers that are enabled in every mode."""
     only_healthy: int = 0
     """Bits that are healthy, but neither present nor enabled."""
     unhealthy: int = 0
@@ -75,7 +75,7 @@ _SENSORS: dict[Kind, _Sensors] = {
     "sub": _Sensors(_BODY | _LASER, always=_RATE | _ATTITUDE | _YAW),
 }
 
-# For each kind of vehicle, pairs of control bits of SYS_STATUS and the modes in which these bits are off.
+# For each kind of vehicle, pairs of controller bits of SYS_STATUS and the modes in which these controllers are off.
 _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
     "copter": (
         (_HEIGHT | _PLACE, (CopterMode.STABILIZE, CopterMode.ACRO)),
@@ -108,7 +108,7 @@ _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
 def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     """Return (present, enabled, healthy) of SYS_STATUS."""
     sensors, nav, kind = _SENSORS[vehicle.KIND], vehicle.navigation, vehicle.KIND
-    # The kinds of control that are off in the present mode.
+    # Bits of the controllers that are off in the present mode.
     uncontrolled = next((bits for bits, modes in _UNCONTROLLED[kind] if vehicle.mode.number in modes), 0)
     controls = sensors.always | (sensors.control & ~uncontrolled)
     present = sensors.working | sensors.control | sensors.unhealthy | _PREARM | _AHRS | _LOGGING

@@ -215,7 +215,7 @@ class SendTime(Snapshot):
 
 
 def _decode_object(data: bytes) -> dict[str, object]:
-    """Return the fields of a JSON object of this protocol version. Empty if it is invalid."""
+    """Return the members of a JSON object whose ``version`` is `VERSION`. Empty for any other data."""
     try:
         fields = json.loads(data)
     except (ValueError, RecursionError):

@@ -448,7 +448,11 @@ class CommandArbiter:
     def _new_order_expecting_late_modes(
         self, modes: Collection[Mode], ending_topics: Sequence[Topic], *, ends_flight: bool = False
     ) -> Order:
-        """Create an order that stays valid if an earlier order changes the mode late."""
+        """Create an order that is not ended by a late mode change, if an earlier order of this program has caused it.
+
+        HEARTBEAT may report the mode of an earlier order, or the mode after a mission, only after the new order was
+        given. Such a report does not count as a takeover; see ``expected`` of :class:`Order`.
+        """
         newest, present_mode = self.newest, self._telemetry.mode.latest
         is_newest_in_progress = newest is not None and present_mode is not None and newest.may_cause(present_mode)
         may_mode_change = is_newest_in_progress or self.mode_is_in_doubt or self._now() < self.mode_settles_at

@@ -416,7 +416,7 @@ class ArmCleanup:
 
     async def _hold_after_arming(self) -> None:
         mode = self._session.telemetry.mode_name
-        logger.warning("the vehicle was armed in %s, which was not ordered, and flies: aerokit orders a hold", mode)
+        logger.warning("the abandoned arm command has started a flight in %s: aerokit orders a hold", mode)
         try:
             await self._hold()
         except AerokitError as error:

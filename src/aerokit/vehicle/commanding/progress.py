@@ -212,10 +212,12 @@ CIRCLE_HEIGHT_M = 20.0
 
 
 class CircleDetector:
-    """Detects that a plane circles a place. Other vehicles can reach it: a boat that circles it has missed it.
+    """Detects that a plane circles a place. A plane cannot stop, so this counts as its arrival.
 
-    The radius is not compared with a parameter: planes enlarge their circles with speed and altitude, and so that their
-    bank angle stays within its limit.
+    A copter or boat never counts as circling: it could stop at the place, so if it circles the place, it has missed it.
+
+    Every radius from `MIN_CIRCLE_RADIUS_M` counts. It is not compared with the radius in the vehicle's parameters,
+    because planes fly larger circles at high speed or altitude, or to limit their bank angle.
     """
 
     def __init__(self, session: VehicleSession) -> None:

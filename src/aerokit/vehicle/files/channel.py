@@ -36,7 +36,7 @@ CLOSE_TIMEOUT_S = 3.0
 
 
 MissingRanges = Callable[[], tuple[tuple[int, int], ...]]
-"""Returns the ranges of bytes (begin, end) that have not arrived."""
+"""Returns the ranges that have not been transferred, as (offset, size) in bytes."""
 
 
 class RemoteFile(NamedTuple):

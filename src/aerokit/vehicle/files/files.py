@@ -36,7 +36,10 @@ MAX_REPLIES_WITHOUT_NEW_ENTRY, MAX_ENTRIES = 50, 1_000_000
 
 
 class FileEntry(Snapshot):
-    """One entry of a directory; ``size`` in bytes, None for directories."""
+    """One entry of a directory.
+
+    ``size`` is in bytes. It is None for a directory, and for a file whose size the vehicle does not report.
+    """
 
     name: str
     size: int | None
@@ -49,14 +52,15 @@ class Files:
 
     Paths are the vehicle's: ``/APM/LOGS`` and ``@PARAM/param.pck`` on ArduPilot, ``/fs/microsd/log`` on PX4.
 
-    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). For a resumed download, ``timeout`` limits each step: reading, comparing the CRC-32, and
-    reading again. You can cancel any call; the file is then closed on the vehicle.
+    All methods but ``is_supported`` take ``idle_timeout_s`` (fail after this many seconds without progress) and
+    ``timeout`` (seconds in total, including the wait for earlier operations; None for no limit). For a resumed
+    download, ``timeout`` limits each step: reading, comparing the CRC-32, and reading again. ``on_progress`` is called
+    with the progress in bytes. You can cancel any call; the file is then closed on the vehicle.
 
     Every method but ``is_supported`` raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; see ``code`` and ``errno``.
-        FileTimeout: the operation did not finish; ``missing`` has the missing ranges.
+        FileTimeout: the operation did not finish; ``missing`` has the missing ranges as (offset, size) in bytes.
     """
 
     def __init__(self, transfers: Transfers) -> None:
@@ -98,12 +102,12 @@ class Files:
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
+        """Copy a file to this computer. The copy is written to ``<to>.part`` and replaces ``to`` when it is complete.
 
-        With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than the part. After a resumed download, aerokit compares the CRC-32 of both files, if the vehicle
-        can compute it. If they differ, the whole file is read again. Files whose names begin with ``@`` are always read
-        completely.
+        An interrupted download leaves ``<to>.part`` for a later one. With ``resume``, the download continues this file,
+        unless the vehicle's file is shorter. After a resumed download, aerokit compares the CRC-32 of both files, if
+        the vehicle can compute it. If they differ, the whole file is read again. Files whose names begin with ``@`` are
+        always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -255,7 +259,7 @@ class Files:
     async def rename(
         self, path: str, new_path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> None:
-        """Rename or move a file or directory; both paths together must fit into one message."""
+        """Rename or move a file or directory. Both paths together may have at most 237 bytes (one message)."""
         data = path_bytes(path) + b"\0" + path_bytes(new_path) + b"\0"
         if len(data) > DATA_SIZE:
             raise InvalidArgument(

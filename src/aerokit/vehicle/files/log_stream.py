@@ -100,6 +100,8 @@ class LogStream(ReadOnly):
     If you append all bytes to a file, the file is a valid ULog file at any time. Lost messages are marked in the log as
     dropouts; ``lost`` counts them. PX4 streams its log to one station at a time.
 
+    The iterator has no end: leave the loop by ``break``, or cancel the task. Leaving the block stops the stream.
+
     Entering raises:
         NotSupported: the vehicle runs ArduPilot. Nothing was sent.
         CommandRejected: PX4 streams to another station, or the port is too slow (below 5 kB/s).

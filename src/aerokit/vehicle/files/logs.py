@@ -94,9 +94,9 @@ class GrowthReporter:
 class Logs:
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
-    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
-    it. You can cancel any call; the vehicle then stops sending.
+    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and, except ``stream``,
+    ``timeout`` (seconds in total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step:
+    finding the log, and reading it. You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed. When such a message requests a log, ArduPilot ends the log
     that it is writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its
@@ -151,8 +151,10 @@ class Logs:
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
-            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
+            FileError: there is no such log, the logs have changed since :meth:`list`, or ``method`` is ``"ftp"`` and
+                the file of the log cannot be identified.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges as (offset, size) in
+                bytes.
             OSError: the local file cannot be written, or another download of this program is writing it.
         """
         _check_id(log)
@@ -188,8 +190,10 @@ class Logs:
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
-            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
+            FileError: there is no such log, the logs have changed since :meth:`list`, or ``method`` is ``"ftp"`` and
+                the file of the log cannot be identified.
+            FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges as (offset, size) in
+                bytes.
         """
         _check_id(log)
         entry, path = await self._locate(log, method, idle_timeout_s, timeout)
@@ -393,7 +397,8 @@ async def log_path(
 ) -> str | None:
     """Return the path of a log for MAVFTP, or None if the file cannot be identified.
 
-    The file must be as large as ``log`` says. With ``may_have_grown``, ArduPilot's file may be larger.
+    The file is found by the log's id, and must be as large as ``log`` says. ArduPilot's newest file may be larger; with
+    ``may_have_grown``, so may an earlier one. PX4's size is that in its list file.
     """
     for directory in directories:
         try:

@@ -67,7 +67,9 @@ class PlanCache:
 
     def __init__(self) -> None:
         self.items: tuple[MissionItem, ...] | None = None
+        """Items, with ArduPilot's home as item 0; None if they are unknown."""
         self.updated_at: float = -math.inf
+        """Time of the last call of `set` or `forget`."""
         self.plan_id: int = 0  # the vehicle's id of these items; 0 if it reports none
         self.changes: int = 0  # number of calls of `set` and `forget`
         # True if the vehicle offers the plan as a file; None until tried.
@@ -175,6 +177,7 @@ class PlanContext:
         return PlanVersion(cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id)
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
+        """Wait up to `PLAN_ID_MAX_AGE_S` for a MISSION_CURRENT with this id. Return True if one has arrived."""
         received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:

@@ -244,7 +244,10 @@ class MissionControl(VehiclePlan["Mission"]):
 
     @property
     def current(self) -> StateCell[int | None]:
-        """Current item (MISSION_CURRENT); None before the start of the mission, and without a mission."""
+        """Number of the current item (MISSION_CURRENT).
+
+        None without a mission, and while ArduPilot reports home as its current item, as it does before the start.
+        """
         return self._tracker.current
 
     @property
@@ -259,7 +262,10 @@ class MissionControl(VehiclePlan["Mission"]):
 
     @property
     def reached(self) -> int | None:
-        """The last item that was reached (MISSION_ITEM_REACHED); None before the first item was reached."""
+        """Number of the item that was reached last (MISSION_ITEM_REACHED), even if the mission has started again since.
+
+        None if no item was reached since the program connected or the vehicle rebooted.
+        """
         return self._tracker.reached
 
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
@@ -280,8 +286,8 @@ class MissionControl(VehiclePlan["Mission"]):
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-            OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
-                fell silent before the item was sent.
+            OperationTimeout: the vehicle did not acknowledge the command. With MISSION_SET_CURRENT: a running transfer
+                did not end, MISSION_CURRENT did not confirm the item, or the vehicle fell silent before it was sent.
         """
         self._check_item(item)
         with self._vehicle_context.arbiter.auxiliary_order() as order:
@@ -297,12 +303,17 @@ class MissionControl(VehiclePlan["Mission"]):
         ArduPilot gets MISSION_START, because a mode change alone does not make it take off. Other autopilots get a mode
         change.
 
+        Args:
+            item: number of the first item to fly.
+            timeout: seconds for each step: to make ``item`` the current item (as in :meth:`set_current`), and to enter
+                the mission mode.
+
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: the vehicle is not armed, its mode changed meanwhile, or no item is left to fly (PX4).
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
-                was busy with a transfer of plans.
+            OperationTimeout: the vehicle did not acknowledge a command, accepted it but stayed in another mode, did not
+                confirm the item, or was busy with a transfer of plans.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._check_item(item)
@@ -358,13 +369,17 @@ class MissionControl(VehiclePlan["Mission"]):
             self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
+        """Wait until the mission has been flown to its end.
+
+        If the last item is a landing, or a return that ends with a landing (copters), this includes the landing. If it
+        is a return without a landing (planes, rovers), the vehicle must be at home; after five minutes of returning, it
+        may also be elsewhere, e.g. at a rally point.
 
         A :meth:`pause` by another task does not end the wait, but a pilot who then changes the mode does. Cancelling
         this call does not stop the vehicle, and no command is sent when it fails.
 
-        aerokit knows from an upload or a download whether the mission ends with a landing. Otherwise, or after another
-        station has replaced the mission, the mode after the completion shows whether the vehicle lands.
+        aerokit knows the last item from an upload or a download. Otherwise, or after another station has replaced the
+        mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
         items and the mission id (PX4 1.15 and later). On a shared link, the vehicle's answer to the other station also

@@ -63,7 +63,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total.
+            timeout: seconds in total, including the wait until other transfers have ended; None for no limit.
             on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has received all new ones.
@@ -75,7 +75,8 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
             MissionTimeout: the vehicle stopped answering; ``missing`` has the items that the vehicle did not confirm.
             VerificationFailed: the vehicle confirmed the plan, but has different items.
-            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it.
+            NotSupported: ``"ftp"`` was requested, but the vehicle does not support it; or a fence or rally points were
+                to be transferred over MAVLink 1, which has only missions.
             FileError, FileTimeout: with ``"ftp"`` only: the vehicle refused an operation on a file, or did not answer.
             OperationTimeout: the transfer was not done within ``timeout``.
         """
@@ -102,7 +103,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             MissionRejected: the vehicle refused.
             MissionTimeout: items did not arrive; ``missing`` has their numbers.
             RemoteProtocolError: the received items are not a valid plan.
-            NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
+            NotSupported, FileError, FileTimeout: as for :meth:`upload`.
             OperationTimeout: the transfer was not complete within ``timeout``.
         """
         async with self._transfer(idle_timeout_s, timeout, on_progress) as transfer:
@@ -111,11 +112,11 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             return plan
 
     async def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
+        """Remove all items of the plan from the vehicle, and verify that it has none. Arguments as for :meth:`upload`.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
-            MissionRejected: the vehicle refused.
+            MissionRejected: the vehicle refused. ArduPilot refuses to clear a mission that it is flying.
             MissionTimeout: the vehicle stopped answering.
             VerificationFailed: the vehicle confirmed the command, but still has items.
             OperationTimeout: the transfer was not done within ``timeout``.
@@ -192,7 +193,7 @@ class FenceControl(VehiclePlan["Fence"]):
 class RallyControl(VehiclePlan["RallyPoints"]):
     """Rally points, where a vehicle may return instead of home: ``await vehicle.rally.upload(RallyPoints([...]))``.
 
-    PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
+    PX4 calls them safe points, and ignores them if its parameter RTL_TYPE is 2 or 4 (return along the mission).
     """
 
     def _get_plan_type(self) -> type[RallyPoints]:

@@ -82,6 +82,7 @@ class PlanChannel:
         return result
 
     async def receive(self, only: Sequence[int] | None = None) -> DownloadResult:
+        """Read the items with the numbers ``only``; None: all items; empty: none, but their count."""
         received = await self._run(
             MissionDownload(
                 *self._target,
@@ -97,6 +98,7 @@ class PlanChannel:
         await self._run(MissionClear(*self._target, **self._wire_options))
 
     async def has_ftp(self, *, by_default: bool) -> bool:
+        """Return True if the vehicle supports MAVFTP; ``by_default`` if it does not report its capabilities."""
         return await self._has_capability(MavProtocolCapability.FTP, by_default=by_default)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
