@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 import pytest
 from onboard_peers import autopilot_and_client, payload_and_station
@@ -10,6 +11,7 @@ from onboard_peers import autopilot_and_client, payload_and_station
 import aerokit
 from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, InvalidArgument
+from aerokit.mavlink import Dialect
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState, MavType
 from aerokit.onboard import CommandRequest, Identity
@@ -136,6 +138,19 @@ async def test_invalid_id_is_refused(arguments: dict[str, int]) -> None:
     with pytest.raises(InvalidArgument):
         async with aerokit.component(near, **arguments):  # type: ignore[arg-type]
             pass
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [{"baud": 9600}, {"dialect": Dialect("own", [m.Heartbeat])}, {"mavlink_version": 1}, {"reconnect": True}],
+)
+async def test_argument_of_link_is_refused_with_open_connection(argument: dict[str, Any]) -> None:
+    near, _ = memory_link_pair()
+    async with open_connection(near) as connection:
+        with pytest.raises(InvalidArgument, match=f"{next(iter(argument))} = … is not allowed with connection=…"):
+            async with aerokit.component(connection=connection, **argument):
+                pass
+        assert not connection.components
 
 
 async def test_ids_of_component_that_closes_are_not_free() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit._internal.arguments import check_range, checked
 from aerokit._internal.async_block import async_block
-from aerokit.connection.opening import open_connection
+from aerokit.connection.opening import DEFAULT_BAUD, open_connection
 from aerokit.errors import BusyError, InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavState, MavType
@@ -92,10 +92,18 @@ async def component(
         )
     if (address is None) == (connection is None):
         raise InvalidArgument("pass either an address or connection=…")
-    link_arguments = (baud, mavlink_version, record, reconnect, peers, may_move, signing)
-    defaults = (57600, 2, None, False, None, False, None)
-    if connection is not None and link_arguments != defaults:
-        raise InvalidArgument("the arguments of a link are not allowed with connection=…: pass them to open_connection")
+    for argument, is_given in (
+        ("baud", baud != DEFAULT_BAUD),
+        ("dialect", dialect is not STANDARD),
+        ("mavlink_version", mavlink_version != 2),
+        ("signing", signing is not None),
+        ("record", record is not None),
+        ("reconnect", reconnect),
+        ("peers", peers is not None),
+        ("may_move", may_move),
+    ):
+        if connection is not None and is_given:
+            raise InvalidArgument(f"{argument} = … is not allowed with connection=…: pass it to open_connection")
     async with AsyncExitStack() as stack:
         if connection is None:
             assert address is not None
