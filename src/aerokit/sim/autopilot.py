@@ -63,7 +63,7 @@ class VehicleSigning:
         signing = _Signing(
             self.key, link_id=link_id, timestamp=first_timestamp, allow_unsigned=self.unsigned_on(link_id)
         )
-        signing.streams = self._streams  # The ports share the last time stamps of all senders.
+        signing.streams = self._streams  # All ports share the table of the senders' last time stamps.
         channel.sign_with(signing)
 
     def is_for(self, link_id: int) -> bool:

@@ -52,7 +52,7 @@ class ArduPilotMissionServer(MissionServer):
         """The mission."""
         self.fence: FenceList = FenceList(self._on_fence_total)
         self._fence_total = 0
-        self._was_fence_stored = False  # since the boot
+        self._was_fence_stored = False  # True once a fence was stored since the boot
         self.rally: RallyList = RallyList()
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,

@@ -269,7 +269,7 @@ class SmartPath:
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
         self._good_at = -math.inf  # time of the last good position
-        self._saved_at = -math.inf  # time at which the path was last not full
+        self._saved_at = -math.inf  # last time at which the path was not full
         self._warned_at = -math.inf
         self._is_started = False  # True after the first `reset`
         self.is_active: bool = False  # True while SMART_RTL is possible.
@@ -396,8 +396,8 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # True for a segment without a length.
     if are_nearly_parallel:
         return None
-    # The nearest places on the two segments, from 0 (start) to 1 (end). The limits of `share2` change
-    # `share1`, which is therefore calculated twice.
+    # Each share locates the nearest point on its segment, from 0 (start) to 1 (end). Limiting `share2` moves the
+    # nearest point of the first segment, so `share1` is calculated again.
     share1 = max(0.0, min(1.0, (dot12 * dot2 - dot22 * dot1) / determinant))
     share2 = max(0.0, min(1.0, (dot12 * share1 + dot2) / dot22))
     share1 = max(0.0, min(1.0, (dot12 * share2 - dot1) / dot11))
