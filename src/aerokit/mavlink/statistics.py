@@ -59,7 +59,7 @@ class SourceStatistics(SourceFields):
     _other_count: int  # number of frames of the other stream
     _other_at: float  # time of its last frame
     _skipped_over: int  # number of frames that count as lost between the two streams
-    _returns: int  # number of frames received of the other stream while it has more frames than the current one
+    _returns: int  # number of frames of the other stream that arrived while it was the longer one
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id

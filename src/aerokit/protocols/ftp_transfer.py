@@ -199,7 +199,8 @@ class FtpDownload(FtpExchange[int]):
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
-        # The server can send this many blocks in one round trip, so this many requests in flight need not queue.
+        # The quotient is the number of blocks that the server sends in one round trip. With so many requests in flight,
+        # none waits in a queue.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 

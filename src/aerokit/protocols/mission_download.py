@@ -149,7 +149,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _on_item(self, item: MissionItemInt | MissionItem, now: float) -> None:
         if self._count is None or item.seq not in self._requested_at:
             return
-        if self._request_counts[item.seq] == 1:  # If it was repeated, the round trip is unknown.
+        if self._request_counts[item.seq] == 1:  # For a repeated request, the round trip is unknown.
             self.round_trip.add_sample(now - self._requested_at[item.seq])
         del self._requested_at[item.seq]
         self._has_error = False

@@ -210,7 +210,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _confirm_items_before(self, seq: int, now: float) -> None:
         """Record that the vehicle has all items before ``seq``."""
-        if self._send_counts.get(seq - 1) == 1:  # If it was repeated, the round trip is unknown.
+        if self._send_counts.get(seq - 1) == 1:  # For a repeated item, the round trip is unknown.
             self._measure(now - self._sent_at[seq - 1])
         self._confirmed_end = seq
         self._attempt = 1

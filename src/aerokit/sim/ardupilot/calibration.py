@@ -60,7 +60,7 @@ class AccelerometerCalibration:
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         is_first_position = position == AccelcalVehiclePos.LEVEL
-        if self.is_held_wrong and not is_first_position:  # A wrong first pose is not detected.
+        if self.is_held_wrong and not is_first_position:  # Only later positions can be wrong.
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)

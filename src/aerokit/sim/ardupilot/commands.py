@@ -153,7 +153,7 @@ class _CommonCommands:
 
     def start_mission(self, command: ReceivedCommand) -> int:
         vehicle = self._vehicle
-        if command.param1 or command.param2:  # The firmware does not support a first and a last item.
+        if command.param1 or command.param2:  # The firmware refuses a first and a last item.
             return Result.DENIED
         result = vehicle.change_to(vehicle.auto.number)
         if result == Result.ACCEPTED:
@@ -229,7 +229,7 @@ class _CommonCommands:
             has_only_zeros = command.place() == (0, 0) and command.z == 0
             if has_only_zeros:
                 point = None
-        self._vehicle.look_at(point)  # None clears the region.
+        self._vehicle.look_at(point)  # None clears the region of interest.
         return Result.ACCEPTED
 
     def look_at_vehicle(self, command: ReceivedCommand) -> int:

@@ -276,7 +276,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     def _execute(self, action: int) -> None:
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
-        if action == _AUTO:  # Landing sequences are not simulated, so the search of the firmware fails.
+        if action == _AUTO:  # Landing sequences are not simulated, so the firmware finds none.
             self.warn("Unable to start landing sequence")
             self.warn("Mode change to AUTO RTL failed: No return path or landing sequence found")
             self.warn("Trying RTL Mode")
