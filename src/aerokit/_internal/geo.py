@@ -58,7 +58,7 @@ def wrap_longitude(longitude_deg: float) -> float:
 
 
 def _wgs84() -> Geodesic:
-    # Imported on first use, because it takes longer than importing all of aerokit.
+    # Imported on first use, because this import takes longer than importing all of aerokit.
     from geographiclib.geodesic import Geodesic
 
     return Geodesic.WGS84

@@ -90,8 +90,8 @@ ARDUPILOT_EXTERNAL = ExternalRules(
         "landing_target": ExternalRule(((("PLND_ENABLED",), (1.0,)), (("PLND_TYPE",), (1.0,)))),
         "optical_flow": ExternalRule(((("FLOW_TYPE",), (5.0,)),)),
     },
-    ned_frame=MavFrame.LOCAL_FRD,  # GCS_Common.cpp, handle_odometry accepts only this frame and treats it as NED.
-    origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin ignores a second origin.
+    ned_frame=MavFrame.LOCAL_FRD,  # handle_odometry (GCS_Common.cpp) accepts only this frame and treats it as NED.
+    origin_is_final=True,  # set_ekf_origin (GCS_Common.cpp) ignores a second origin.
 )
 
 # Bits of EKF2_EV_CTRL: 1 horizontal position, 2 vertical position, 4 velocity, 8 yaw.
@@ -120,5 +120,5 @@ PX4_EXTERNAL = ExternalRules(
     has_vision_speed=False,
     flow_in_radians=True,
     constant_position_at_rest=True,  # PX4 sets CONST_POS_MODE at rest, ArduPilot only if no sensor supplies positions.
-    target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target refuses positions in other frames.
+    target_is_local=True,  # handle_message_landing_target (mavlink_receiver.cpp) refuses other frames.
 )

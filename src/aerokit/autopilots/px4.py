@@ -116,7 +116,7 @@ class Px4(Autopilot):
     silent_without_logs = True
     _bytewise_by_default = True
     has_parameter_hash = True
-    unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # Inside PX4, −1 A (-100) means "unknown".
+    unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # PX4 may send an unknown current as −1 A (-100).
     reposition_purpose: Purpose = "hold"
     holds_after_mission = True
     mission_end_text: str | None = "Mission finished"  # mission_base.cpp

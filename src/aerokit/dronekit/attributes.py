@@ -120,7 +120,7 @@ class VehicleAttributes(VehicleCore):
     _dk_ekf_flags: int | None = None
     _dk_ekf_ok = False
     _home_location: LocationGlobal | None = None
-    _dk_confirmed_home: LocationGlobal | None = None  # never a new home that may still be refused
+    _dk_confirmed_home: LocationGlobal | None = None  # home as the vehicle has last confirmed it
 
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)

@@ -105,7 +105,7 @@ class Command(_MissionItem):
     ) -> None:
         numbers = (param1, param2, param3, param4, x, y, z)
         super().__init__(target_system, target_component, seq, frame, command, current, autocontinue, *numbers)
-        self._fieldnames = FIELDS  # fields in str(command)
+        self._fieldnames = FIELDS  # the fields that str(command) shows
 
 
 class SequenceState(Snapshot):
@@ -254,7 +254,7 @@ class CommandSequence:
             items = list(self._state.items)
             position = len(items) if index == len(items) else _checked_index(index, len(items))
             command.seq = position + 1
-            items[position : position + 1] = [command]  # At the end, this appends, as in pymavlink.
+            items[position : position + 1] = [command]  # The index after the last item appends, as in pymavlink.
             self._state = self._state.replace(items=tuple(items), is_changed=True)
 
     def rows(self) -> tuple[Command, ...]:

@@ -141,8 +141,8 @@ class FlightMethods(VehicleAttributes):
         if wait:
 
             def is_done() -> bool:
-                # As long as an earlier opposite order has no effect, HEARTBEAT reports the wanted state. It proves
-                # nothing until `order` is done.
+                # While an earlier opposite order has no effect yet, HEARTBEAT still reports the wanted state, which
+                # proves nothing until `order` is done.
                 return self._dk_reports_armed(armed) and (order.done() or not had_opposite_order)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)

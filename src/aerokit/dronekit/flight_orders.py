@@ -177,7 +177,7 @@ async def go_to(vehicle: AsyncVehicle, target: Target) -> None:
             )
         except CommandRejected as error:
             is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
-            is_overruled = bool(order.end)  # by a newer order or a mode change
+            is_overruled = bool(order.end)  # True if a newer order or a mode change has ended the order
             is_silent = vehicle.heartbeat_age > MODE_MAX_AGE_S
             if not is_unsupported or is_overruled or is_silent:
                 raise

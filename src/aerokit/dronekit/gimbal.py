@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 HOME_TIMEOUT_S = 10.0
-MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles are refused there
+MAX_ANGLE_DEG = 360.0  # vehicle.aio.gimbal refuses larger angles
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None)
 
 

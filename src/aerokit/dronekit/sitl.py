@@ -126,7 +126,7 @@ class SITL:
             instance = _next_instance
             _next_instance += 1
         self.instance: int = instance
-        self._kind: str | None = None  # None: the kind of the --sim vehicle, or a copter without --sim
+        self._kind: str | None = None  # None selects the kind of the --sim vehicle, or a copter without --sim
         self._served: ServedVehicle | None = None  # None before launch()
 
     def download(self, system: str, version: str, target: str | None = None, verbose: bool = False) -> None:

@@ -222,7 +222,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
         timeout = heartbeat_limit_s or CONNECT_TIMEOUT_S
         with self._dk_initializing:
-            if self._dk.aio_or_none is not None:  # An earlier call has connected it.
+            if self._dk.aio_or_none is not None:  # An earlier call has connected the vehicle.
                 self._dk_wait_until_booted(timeout)
                 return
             self._dk.heartbeat_limit_s = heartbeat_limit_s

@@ -41,7 +41,7 @@ _find_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).findit
 # Verdicts about a position in the data.
 _VALID = 0  # a whole frame with a valid checksum
 _INCOMPLETE = 1  # the beginning of a plausible frame: wait for its rest
-_UNLIKELY = 2  # the beginning of an unlikely frame: wait for its rest, but also look for frames that begin inside it
+_UNLIKELY = 2  # like _INCOMPLETE, but an unknown message or too long: also look for frames that begin inside it
 _UNKNOWN_MESSAGE = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5
@@ -60,7 +60,7 @@ class _ValidFrame(NamedTuple):
 class _OutOfOrder(NamedTuple):
     """A frame whose sequence number was not the expected one."""
 
-    position: int  # in the list of returned frames, if the message is wanted
+    position: int  # index in the list of returned frames, if the message is wanted
     ordering: int  # LATE or OTHER_SENDER
     identity: int  # sequence number << 16 | component id << 8 | system id
 
@@ -257,7 +257,7 @@ class PythonFramer:
         # `_NOISE` is a placeholder. The end 0 makes the loop examine every candidate, which replaces both values.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
-        end_of_data = (size, _NOISE, size)  # decides about an unknown frame at the end of the data
+        end_of_data = (size, _NOISE, size)  # makes the loop decide about an unknown frame at the end of the data
         for position, verdict, end in chain(scan.candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
                 # No valid frame begins inside the unknown frame. Skip it whole if a frame or nothing follows.
@@ -364,7 +364,7 @@ class PythonFramer:
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
     """Return the lowest of these positions in the data. -1 for ``keep_from`` or ``unknown_begin`` means none."""
-    if unknown_begin >= 0:  # `_search` sets `unknown_begin` only before `keep_from`.
+    if unknown_begin >= 0:  # `_search` sets `unknown_begin` only before `keep_from`, so it is lower.
         return unknown_begin
     return position if keep_from < 0 else keep_from
 

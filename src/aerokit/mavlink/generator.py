@@ -128,7 +128,7 @@ MODULES: dict[str, tuple[str, ...]] = {
 }
 
 # The messages of ``common.xml`` that most flights use. They are in ``common.py``, the other two hundred in
-# ``common_more.py``. A program that uses none of the two hundred does not import ``common_more``, which is slow.
+# ``common_more.py``. A program that uses none of the two hundred avoids the slow import of ``common_more``.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt

@@ -16,7 +16,7 @@ _MAX_GAP = 16  # A frame after a larger gap may come from a second sender with t
 _MIN_ALTERNATIONS = 10  # If two series of sequence numbers alternate this often, they are from two senders.
 _EXPIRY_S = 5.0  # A second sender with the same ids is forgotten after this silence.
 _STREAM_TIMEOUT_S = 1.5  # Autopilots send HEARTBEAT every second, so a sender that is silent for longer has ended.
-_MIN_RETURNS = 3  # The other stream replaces the current one after this many frames, if it has more frames.
+_MIN_RETURNS = 3  # After this many frames, a longer other stream replaces the current one.
 
 # Results of :meth:`SourceStatistics.out_of_order`.
 IN_ORDER, LATE, OTHER_SENDER = range(3)
@@ -55,11 +55,11 @@ class SourceStatistics(SourceFields):
 
     _repetitions: int  # number of repeated frames with consecutive sequence numbers, up to the last one
     # If two senders use the same ids, their sequence numbers form two streams. `expected` belongs to the current one,
-    # these attributes to the other one. They are set when a second stream begins.
+    # the next four attributes to the other one. They are set when a second stream begins.
     _other_count: int  # number of frames of the other stream
     _other_at: float  # time of its last frame
     _skipped_over: int  # number of frames that count as lost between the two streams
-    _returns: int  # number of frames received of the other stream while it has more frames than the current one
+    _returns: int  # number of frames of the other stream that arrived while it was the longer one
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id

@@ -199,7 +199,7 @@ class ComponentCommands:
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             try:
                 return function(*arguments)
-            except asyncio.CancelledError as error:  # For example by `result()` of a task that was cancelled.
+            except asyncio.CancelledError as error:  # raised by `result()` of a cancelled task, for example
                 raise RuntimeError("the function raised CancelledError") from error
         return self._call_in_thread(function, *arguments)
 

@@ -171,7 +171,8 @@ class GimbalAdapter(GimbalMount):
         self._record(flags, is_yaw_locked=target.yaw_locked)
 
     def _record(self, flags: int, *, is_yaw_locked: bool) -> None:
-        # Called after the program's method has returned. If it raises an exception instead, the gimbal may still turn.
+        # Called after the program's method has returned. If the method raises, the gimbal may still turn, and the stop
+        # function stays.
         self._stop_functions.pop("gimbal", None)
         self.flags: int = flags
         self._is_yaw_locked = is_yaw_locked

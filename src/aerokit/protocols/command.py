@@ -251,7 +251,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._order_status = order_status
         self._sent_by_caller = sent_by_caller
         self._sent_count = 0  # number of transmissions, including a first one by the caller
-        self._dropped_count = 0  # number of these transmissions that no link accepted
+        self._dropped_count = 0  # number of transmissions that no link accepted
         self.final_acks: int = 0
         """Number of acknowledgements received except IN_PROGRESS, including those to earlier, equal commands."""
         self._in_progress = False

@@ -237,7 +237,7 @@ class FtpClient:
         self.source_system: int = source_system
         self.source_component: int = source_component
         self._sequence = first_sequence
-        # `next_session` limits this to 8 bits. Like the sequence number, it should differ between programs.
+        # Like the sequence numbers, the session numbers of two programs should differ. `next_session` uses 8 bits.
         self._session = first_sequence
 
     def next_sequence(self, replies: int = 1) -> int:

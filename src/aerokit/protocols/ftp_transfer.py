@@ -89,7 +89,7 @@ class _Burst:
     def file_end(self, reply: FtpMessage) -> int | None:
         """Return the end of the file, or None if this NAK does not belong to the burst."""
         blocks = self.blocks_before(reply)
-        if blocks == 0:  # The burst began at or after the end.
+        if blocks == 0:  # The burst began at or after the end of the file.
             return self.offset
         last_offset = self.offset + (blocks - 1) * DATA_SIZE
         if not last_offset <= reply.offset <= last_offset + DATA_SIZE:
@@ -199,7 +199,8 @@ class FtpDownload(FtpExchange[int]):
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
-        # The server can send this many blocks in one round trip, so this many requests in flight need not queue.
+        # The quotient is the number of blocks that the server sends in one round trip. With so many requests in flight,
+        # none waits in a queue.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
@@ -238,7 +239,7 @@ class FtpDownload(FtpExchange[int]):
         self._requests.discard_from(end)
 
     def _is_plausible(self, offset: int) -> bool:
-        # After a block far beyond all others, millions of blocks would count as missing.
+        # A block far beyond all others is ignored, because millions of blocks before it would count as missing.
         return not self._is_past_size(offset) and offset - self._reassembly.tail < MAX_BLOCK_DISTANCE
 
     def _is_past_size(self, offset: int) -> bool:

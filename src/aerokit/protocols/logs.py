@@ -119,7 +119,7 @@ class LogDownload(Transfer[int]):
         self._proceed(now)
 
     def _is_plausible(self, offset: int) -> bool:
-        # After a block far beyond the data received so far, millions of blocks would count as missing.
+        # A block far beyond the data received so far is ignored: millions of blocks before it would count as missing.
         return offset < self._size and offset - self._reassembly.tail < MAX_RANGE * LOG_BLOCK
 
     def _on_block(self, message: LogData, now: float) -> None:

@@ -149,7 +149,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _on_item(self, item: MissionItemInt | MissionItem, now: float) -> None:
         if self._count is None or item.seq not in self._requested_at:
             return
-        if self._request_counts[item.seq] == 1:  # The answer to a repeated request measures nothing.
+        if self._request_counts[item.seq] == 1:  # For a repeated request, the round trip is unknown.
             self.round_trip.add_sample(now - self._requested_at[item.seq])
         del self._requested_at[item.seq]
         self._has_error = False
@@ -251,7 +251,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._outbox += self.cancellation()
         # The caller's item 0 is the first one after home.
         missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)
-        has_count = bool(self._indices)  # A restart resets `_count` to None.
+        has_count = bool(self._indices)  # Not `_count`, which a restart resets to None.
         details = f"missing: {format_ranges(missing) or 'home'}" if has_count else "no MISSION_COUNT was received"
         self._fail(
             MissionTimeout(

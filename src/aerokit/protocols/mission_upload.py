@@ -132,8 +132,8 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._is_older_upload_open |= is_request and self._is_for_us(message)
             return
         if isinstance(message, MissionAck):
-            # Without progress for long, ERROR means that the vehicle's transfer has expired: our items were lost, even
-            # if its requests arrived. The upload then starts again.
+            # After a long time without progress, ERROR means that the vehicle's transfer has expired: our items were
+            # lost, even if its requests arrived. The upload then starts again.
             has_expired = self._vehicle_has_requested and now - self._progress_at >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(message.type, now)
@@ -153,7 +153,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         if not self._vehicle_has_requested:
             self._announce_items(now)
         elif self._was_forgotten and now - self._progress_at >= TRANSFER_EXPIRY_S:
-            # After a reboot, PX4 does not answer items. ArduPilot refuses new uploads during the first seconds.
+            # After a reboot, PX4 does not answer items, so the upload starts again. It starts after a pause, because
+            # ArduPilot refuses uploads during its first seconds.
             self._restart(MavMissionResult.ERROR, now)
         elif self._sent_end < self._end:
             may_send_ahead = self._window > 1  # With a window of 1, items are only sent on request.
@@ -209,7 +210,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _confirm_items_before(self, seq: int, now: float) -> None:
         """Record that the vehicle has all items before ``seq``."""
-        if self._send_counts.get(seq - 1) == 1:  # The answer to a repeated item measures nothing.
+        if self._send_counts.get(seq - 1) == 1:  # For a repeated item, the round trip is unknown.
             self._measure(now - self._sent_at[seq - 1])
         self._confirmed_end = seq
         self._attempt = 1
@@ -231,7 +232,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._on_accepted(ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._vehicle_has_requested:
-                # The vehicle answers so if it already has the item, or if a preceding item is missing.
+                # This answer means that the vehicle already has the item, or that a preceding item is missing.
                 self._repeat_unconfirmed(now, ahead=1)
                 if self._outbox:  # If nothing was sent, the present deadline stays.
                     self._wait(now)
@@ -243,7 +244,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._fail_as_refused(result)
 
     def _on_accepted(self, opaque_id: int, now: float) -> None:
-        # Before all items were sent, an ACCEPTED answers an earlier upload, which may have ended with our first items.
+        # Before all items were sent, an ACCEPTED is about an earlier upload, which our first items may have completed.
         if self._vehicle_has_requested and self._sent_end < self._end:
             self.was_accepted_early = True
         elif self._vehicle_has_requested:

@@ -163,7 +163,7 @@ class MissionClear(MissionExchange[None]):
         if not isinstance(message, MissionAck) or not self._is_ours(message):
             return
         if message.type == MavMissionResult.ACCEPTED:
-            if self._attempt == 1:  # The answer to a repeated request measures nothing.
+            if self._attempt == 1:  # For a repeated request, the round trip is unknown.
                 self.round_trip.add_sample(now - self._sent_at)
             self._finish(None)
         elif message.type == MavMissionResult.ERROR and not self._has_error:

@@ -139,7 +139,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     """
 
     window_size: ClassVar[int]  # initial limit of requests in flight
-    max_window_size: ClassVar[int | None] = None  # the highest limit; None: that of `RequestWindow`
+    max_window_size: ClassVar[int | None] = None  # the highest limit; None uses the default of `RequestWindow`
     _may_probe = False  # True to detect unknown names by a probe. No request is then sent as two copies.
 
     def __init__(

@@ -13,8 +13,8 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 
 # ArduPilot queues 20 PARAM_REQUEST_READ and drops further ones.
 DEFAULT_SIZE = 20
-# The window grows to at most this many times its initial size. On slow links, most of the requests are in transit, so
-# that the vehicle's queue does not overflow.
+# The window grows to at most this many times its initial size. It grows only while answers stay fast. Most of the
+# requests are then in transit, so the vehicle's queue does not overflow.
 MAX_GROWTH = 5
 # An answer has waited in a queue if it takes longer than QUEUED_FACTOR times the fastest answer plus QUEUED_MARGIN_S.
 QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
@@ -159,7 +159,7 @@ class RequestWindow(PendingRequests[KeyT]):
             return []
         if request.attempts == 1:
             self._measure(now - request.first_at)
-        elif not request.was_duplicated:  # The answer may belong to either attempt. A second answer will tell.
+        elif not request.was_duplicated:  # The answer may belong to any attempt; see `_on_duplicate_answer`.
             self._ambiguous[key] = now - request.first_at
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
@@ -216,7 +216,7 @@ class RequestWindow(PendingRequests[KeyT]):
             self._max_in_flight = max(self._max_in_flight - 1, self._initial_size)
 
     def _record_transmission(self, key: KeyT, now: float) -> PendingRequest:
-        due_at = now + self._timeout_s(self.attempts(key) + 1)  # The time-out depends on the other requests.
+        due_at = now + self._timeout_s(self.attempts(key) + 1)  # before `len(self)` includes this request
         request = super()._record_transmission(key, now)
         request.due_at = due_at
         return request

@@ -63,7 +63,7 @@ class VehicleSigning:
         signing = _Signing(
             self.key, link_id=link_id, timestamp=first_timestamp, allow_unsigned=self.unsigned_on(link_id)
         )
-        signing.streams = self._streams  # The ports share the last time stamps of all senders.
+        signing.streams = self._streams  # All ports share the table of the senders' last time stamps.
         channel.sign_with(signing)
 
     def is_for(self, link_id: int) -> bool:
@@ -329,7 +329,7 @@ class SimulatedBattery:
 
     def drain(self, current_a: float, dt: float) -> None:
         self.current_a = current_a
-        used_mah = current_a * dt / 3.6  # 1 mAh is 3.6 As.
+        used_mah = current_a * dt / 3.6  # 1 mAh is 3.6 ampere-seconds.
         self.consumed_mah += used_mah
         self.consumed_wh += used_mah * self.voltage_v / 1000.0
         self._charge_mah = max(0.0, self._charge_mah - used_mah)

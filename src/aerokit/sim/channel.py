@@ -42,7 +42,7 @@ def _fit_field(field: Field, value: Any) -> Any:
             return value.encode(errors="replace")[:max_bytes].decode(errors="ignore")
         if isinstance(value, bytes) and not field.is_text:
             return value[: field.array_length]
-        return value  # of a wrong type
+        return value  # The value has a wrong type.
     if isinstance(value, tuple):
         return tuple(_fit_number(field.type, element) for element in value)
     return _fit_number(field.type, value)

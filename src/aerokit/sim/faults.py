@@ -73,7 +73,7 @@ class Faults:
     mute_parameters: set[str] = field(default_factory=set)
     commands: dict[int, CommandFault] = field(default_factory=dict)
 
-    if not TYPE_CHECKING:  # Type checkers accept any name in a class with `__setattr__`.
+    if not TYPE_CHECKING:  # If type checkers saw `__setattr__`, they would accept any name.
 
         def __setattr__(self, name: str, value: object) -> None:
             if name not in self.__dataclass_fields__:

@@ -62,7 +62,7 @@ class SimParameters:
     """
 
     def __init__(self, text: str, count: int | None = None) -> None:
-        # `_unlisted` has the names that the list leaves out.
+        # `_unlisted` contains the names of the parameters that are not among the first `count`.
         lines, switches, self._unlisted = _lines_and_switches(text, count)
         self._rows: dict[str, SimParameter | str] = dict(lines)
         # Maps the name of a parameter to the name of the parameter that enables it.
@@ -83,7 +83,7 @@ class SimParameters:
         row = self.row(name)
         row.value = stored_value(value, row.type)
         if name in self._switches.values():
-            self._names = None  # `names` is made again, because the switch may show or hide parameters.
+            self._names = None  # Compute `names` again, because the switch may show or hide parameters.
 
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
@@ -178,7 +178,7 @@ def _lines_and_switches(
     switches = {name: switch for name, switch in all_switches.items() if switch is not None}
     if count is None:
         return lines, switches, frozenset()
-    # The parameters that need a switch are among those that are not listed, so no switch is needed.
+    # Parameters with a switch are never listed, so the returned switches are empty.
     listed = [name for name in lines if name not in switches][:count]
     return lines, {}, frozenset(lines).difference(listed)
 

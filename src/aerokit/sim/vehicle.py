@@ -121,7 +121,7 @@ class SimulatedVehicle:
         self._timers: list[tuple[float, int, Callable[[], None], object]] = []
         self._timer_count = 0
         self._first_tick_at = self._next_tick_at = math.inf  # infinity while the vehicle does not tick
-        self._ticks_done = 0  # since `_first_tick_at`, in units of TICK_S
+        self._ticks_done = 0  # number of units of TICK_S that have passed since `_first_tick_at`
         self._text_id = 0  # id of the last STATUSTEXT that was split into several messages
         self.is_on: bool = False
         """False before the power-on and during a reboot."""

@@ -385,7 +385,7 @@ class UnderwaterMotion(Motion):
 
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
         super()._integrate(north, east, down, dt)
-        surface_down = self.ground_down  # where a submarine starts
+        surface_down = self.ground_down  # A submarine starts at the surface.
         if self.down < surface_down:
             self.down = surface_down
             self.velocity_down = max(0.0, self.velocity_down)

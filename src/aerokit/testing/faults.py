@@ -14,7 +14,7 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# Passes the flight's scheduler to its argument, a function that schedules faults.
+# A function that passes the flight's scheduler to its argument, which schedules faults.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 

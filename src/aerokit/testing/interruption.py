@@ -79,7 +79,7 @@ class Interruption:
 
 def _is_sigint_available() -> bool:
     """Return True if an Interruption may replace the handler of SIGINT."""
-    # Shells set SIG_IGN for the background jobs of a script, so this handler may be replaced, too.
+    # SIG_IGN may be replaced, too, because shells set it for the background jobs of a script.
     handler = signal.getsignal(signal.SIGINT)
     is_of_interruption = isinstance(getattr(handler, "__self__", None), Interruption)
     return is_of_interruption or handler in (signal.default_int_handler, signal.SIG_IGN)

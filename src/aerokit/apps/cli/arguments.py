@@ -214,7 +214,7 @@ def assignment(text: str) -> tuple[str, int | float]:
     except ValueError:
         raise ArgumentTypeError(f"the value in {text!r} is not a finite number; expected NAME=VALUE") from None
     try:
-        checked_value(check_name(name), number, ParameterType.REAL32)  # only for its errors
+        checked_value(check_name(name), number, ParameterType.REAL32)  # called only for the errors that it raises
     except InvalidArgument as error:
         raise ArgumentTypeError(str(error)) from None
     return name, number

@@ -100,7 +100,7 @@ def _network(text: str) -> str:
 
 def _broker(text: str) -> str:
     try:
-        _without_password(text)  # only for its errors, which do not show the password
+        _without_password(text)  # called only for the errors that it raises, which do not show the password
     except InvalidArgument as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return text

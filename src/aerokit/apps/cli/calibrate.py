@@ -138,7 +138,7 @@ async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:
             await calibration.cancel()
     except (NotSupported, OperationTimeout) as error:
         problem = str(error)
-    except TimeoutError:  # of `fail_after`; it has no text
+    except TimeoutError:  # raised by `fail_after`, without a text
         problem = f"it did not confirm within {_CANCEL_TIMEOUT_S:g} s"
     text = f"not cancelled on the vehicle: {problem}" if problem else "cancelled on the vehicle"
     record = {"sensor": options.sensor, "is_cancelled": not problem, "text": text}

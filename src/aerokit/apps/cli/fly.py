@@ -72,7 +72,7 @@ class PlanFlight(SupervisedFlight):
         if not await self._is_confirmed():
             self._print("not confirmed; nothing was started")
             return FAILED
-        self._check_disarmed()  # once more, because much may have happened before the user answered
+        self._check_disarmed()  # once more, because the user may have taken long to answer
         if not self._options.sim and await self._download_mission() != uploaded_mission:
             raise OperationRejected("the mission on the vehicle changed after the upload; nothing was started")
         self._print("arming")

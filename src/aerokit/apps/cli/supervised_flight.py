@@ -248,7 +248,7 @@ class SupervisedFlight(ABC):
         vehicle = self._vehicle
         has_only_armed = not (self._has_changed_mode or self._has_left_mode)
         if has_only_armed and vehicle.mode_name in self._modes_armed_in:
-            return self._is_armed_on_ground  # This program has not taken off. If the vehicle flies, a pilot has.
+            return self._is_armed_on_ground  # This program has not taken off: in the air, a pilot flies.
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 
@@ -363,7 +363,7 @@ class FlightReport:
             lines.append(f"next: aerokit report {force}{shlex.quote(recorded_in)}")
         else:
             lines += [frames, "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`"]
-        self._emit("flight_summary", record, "\n".join(lines), may_block=True)  # the flight is over
+        self._emit("flight_summary", record, "\n".join(lines), may_block=True)  # may block, because the flight is over
 
     def _describe_armed(self, speed: float) -> str:
         """Return "armed for 47 s", with notes on an impact and on the speed of a simulation.

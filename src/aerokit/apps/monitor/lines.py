@@ -296,7 +296,7 @@ class Canvas:
 
     def __init__(self, columns: int, rows: int, points: Iterable[tuple[float, float]]) -> None:
         self._columns = max(columns, 2)
-        self._rows = max(rows - 1, 2)  # without the last row
+        self._rows = max(rows - 1, 2)  # without the row of the scale bar
         all_points = list(points) or [(0.0, 0.0)]
         norths, easts = zip(*all_points, strict=True)
         self._middle_north = (max(norths) + min(norths)) / 2

@@ -91,7 +91,7 @@ class FlightWatch:
         self._still_since = math.inf  # when the vehicle stopped after the impact
         self._still_samples = 0  # number of velocity reports after `_still_since`
         self._moving_since = math.inf  # when the crashed vehicle began to move
-        self._take_off_altitude_m: float | None = None  # where the crashed vehicle reported a take-off
+        self._take_off_altitude_m: float | None = None  # altitude at which the crashed vehicle reported a take-off
 
     def _restart_detection(self) -> None:
         self._forget_impact()

@@ -262,8 +262,8 @@ def _rotation(attitude: Attitude | None) -> dict[str, float]:
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     if attitude is not None and all(map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))):
         w, x, y, z = attitude.quaternion
-    # MAVLink's quaternion is that of a body frame (forward, right, down) in the frame (north, east, down). Both frames
-    # are changed by a rotation of 180°, which results in these sums and differences.
+    # MAVLink's quaternion rotates (forward, right, down) to (north, east, down), Foxglove's (forward, left, up) to
+    # (east, north, up). Both changes are rotations by 180°, which result in these sums and differences.
     half = math.sqrt(0.5)
     return {"x": half * (x + y), "y": half * (x - y), "z": half * (w - z), "w": half * (w + z)}
 

@@ -149,7 +149,7 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
     Those from shortly before arming or shortly after disarming are included.
     """
     groups: list[list[FailsafeEvidence]] = []
-    recent_groups: list[list[FailsafeEvidence]] = []  # those to which the next evidence may belong
+    recent_groups: list[list[FailsafeEvidence]] = []  # the groups to which the next evidence may belong
     for evidence in flight.failsafe_evidence:
         is_near_armed = any(
             begin - _BEFORE_ARMING_S <= evidence.time_s <= end + _AFTER_DISARMING_S for begin, end in flight.armed

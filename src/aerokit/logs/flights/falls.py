@@ -116,7 +116,7 @@ def _fall(flight: FlightLog, descent: _Descent) -> Fall | None:
     if not lost_height_m >= _MIN_HEIGHT_M:  # `not >=` is also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    # A log that ends during the descent lacks the impact. At this rate, it must be less than two seconds away.
+    # A log that ends during the descent lacks the impact, which must then be less than two seconds away.
     hits_ground_soon = end_height_m < 2 * sink_m_s
     is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else hits_ground_soon
     if not (is_on_ground or reasons):  # A logged reason, such as disarming in the air, proves a fall at any height.

@@ -50,7 +50,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
         if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     reader_class = import_module("pymavlink.DFReader").DFReader_binary
-    reader = reader_class.__new__(reader_class)  # apart from __init__, so that it can be closed if __init__ raises
+    reader = reader_class.__new__(reader_class)  # without __init__, which may raise: `close_bin` needs the object
     try:
         with redirect_stdout(sys.stderr):  # pymavlink prints about damage, but stdout may be for JSON
             reader.__init__(str(path), progress_callback=on_percent)
@@ -183,7 +183,7 @@ class BinReader(_RowReader):
 def _bin_system_id(reader: Any) -> int:
     """Return the system id among the logged parameters, and rewind the reader."""
     parameters: dict[str, float] = {}
-    with suppress(Exception), redirect_stdout(sys.stderr):  # `_next` reports damage
+    with suppress(Exception), redirect_stdout(sys.stderr):  # `_next` reports damage later
         while (row := reader.recv_match(type=["PARM"])) is not None:
             parameters.setdefault(row.Name, row.Value)
     reader.rewind()

@@ -150,7 +150,8 @@ class _Tables:
         return [list(compress(column, kept)) for column in times_and_columns]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        # Rows have no checksum, so a time may be damaged. `TimeSeries.add` would pass a late one on to later rows.
+        # Rows have no checksum, so a time may be damaged. After a damaged late time, `TimeSeries.add` would give this
+        # time to later rows, too.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time

@@ -74,7 +74,7 @@ class LinkCounter:
 
     def __init__(self, flight: FlightLog) -> None:
         self._series, self._silences = flight.link, flight.silences
-        self._second = 0  # the second that is being counted
+        self._second = 0  # the second whose frames are being counted
         self._received = 0
         self._lost = 0
 

@@ -31,7 +31,7 @@ class AccelerometerCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.is_held_wrong = False  # If True, the calibration fails after the second position.
-        self._run_number = 0  # number of this calibration; timers of earlier calibrations do nothing
+        self._run_number = 0  # increased by every start and reset, so that timers of earlier calibrations do nothing
         self._requested: int | None = None  # position or result that is sent repeatedly; None if nothing is sent
 
     @property
@@ -60,7 +60,7 @@ class AccelerometerCalibration:
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         is_first_position = position == AccelcalVehiclePos.LEVEL
-        if self.is_held_wrong and not is_first_position:  # A wrong first pose is not detected.
+        if self.is_held_wrong and not is_first_position:  # Only later positions can be wrong.
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
@@ -222,7 +222,7 @@ class Calibrations:
         is_barometer_requested = command.param3 == 1.0
         if is_gyro_requested:
             vehicle.info("Initialising ArduPilot")
-            # Without percentages, only the result is sent.
+            # `percents` is empty, so the only acknowledgement is the final one.
             return CommandProgress(percents=(), interval_s=_GYRO_CALIBRATION_S)
         if is_barometer_requested:
             vehicle.info("Updating barometer calibration")

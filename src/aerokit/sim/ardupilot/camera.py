@@ -69,7 +69,7 @@ class ArduPilotCamera:
         if self.remaining:
             is_due = self._vehicle.now - self._taken_at > self.interval_s
             is_taken = is_due and self.take()
-            if is_taken and self.remaining > 0:  # An unlimited series (-1) is not counted.
+            if is_taken and self.remaining > 0:  # An unlimited series (-1) is not counted down.
                 self.remaining -= 1
         elif self.trigger_distance_m > 0.0:
             self._check_distance()

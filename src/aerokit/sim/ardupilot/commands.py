@@ -35,7 +35,7 @@ _FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
 
 def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     common, requests = _CommonCommands(vehicle), vehicle.requests
-    # The table lists commands that the simulation does not execute, and the MAV_RESULT that answers each of them.
+    # `fixed_results.csv` lists commands that the simulation does not execute, each with the MAV_RESULT that it returns.
     handlers: dict[int, CommandHandler] = {
         Cmd[command]: common.constant_answer(Result[result], _FIXED_TEXTS.get((Cmd[command], vehicle.KIND), ()))
         for command, result in rows_of(vehicle.KIND, "fixed_results.csv")
@@ -52,7 +52,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         **handlers,
         Cmd.DO_GRIPPER: lambda command: vehicle.devices.grip(command),
         Cmd.DO_SET_SERVO: lambda command: vehicle.devices.set_servo(command),
-        # Only the first pulse is simulated, which sets the servo as DO_SET_SERVO does.
+        # The simulation executes only the first of the repeated movements, like a DO_SET_SERVO.
         Cmd.DO_REPEAT_SERVO: lambda command: vehicle.devices.set_servo(command),
         Cmd.DO_SET_RELAY: lambda command: vehicle.devices.set_relay(command),
         Cmd.DO_REPEAT_RELAY: lambda command: vehicle.devices.set_relay(command),
@@ -143,7 +143,7 @@ class _CommonCommands:
         if not 0 <= command.param1 < vehicle.missions.commands.count:
             return Result.DENIED
         if resets_mission:
-            vehicle.mission.reset()  # sets the counters of jumps to 0
+            vehicle.mission.reset()  # also sets the counters of DO_JUMP to 0
         if not vehicle.mission.set_current(to_int(command.param1)):
             return Result.FAILED
         if resets_mission:
@@ -153,7 +153,7 @@ class _CommonCommands:
 
     def start_mission(self, command: ReceivedCommand) -> int:
         vehicle = self._vehicle
-        if command.param1 or command.param2:  # The firmware does not support a first and a last item.
+        if command.param1 or command.param2:  # The firmware refuses a first and a last item.
             return Result.DENIED
         result = vehicle.change_to(vehicle.auto.number)
         if result == Result.ACCEPTED:
@@ -214,7 +214,7 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def control_high_latency(self, command: ReceivedCommand) -> int:
-        # No port supports high-latency mode.
+        # The simulated vehicle has no high-latency link that the command could enable.
         if command.param1:
             return Result.FAILED
         self._vehicle.send_text(_NOTICE, "High Latency disabled")
@@ -229,7 +229,7 @@ class _CommonCommands:
             has_only_zeros = command.place() == (0, 0) and command.z == 0
             if has_only_zeros:
                 point = None
-        self._vehicle.look_at(point)  # None clears the region.
+        self._vehicle.look_at(point)  # None clears the region of interest.
         return Result.ACCEPTED
 
     def look_at_vehicle(self, command: ReceivedCommand) -> int:

@@ -195,7 +195,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if self._disarm_if_landed(name):
             return _NONE
         if mode.is_landing:
-            # `BATTERY_PRIORITIES` begins with the most severe actions, TERMINATE and LAND.
+            # True for LAND and for the only action before it in `BATTERY_PRIORITIES`, TERMINATE.
             is_landing_for_battery = self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND)
             if self.battery_is_low and is_landing_for_battery:
                 self.warn(f"{name} + Battery Failsafe - Continuing Landing")
@@ -276,7 +276,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
     def _execute(self, action: int) -> None:
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
-        if action == _AUTO:  # Landing sequences are not simulated, so the search of the firmware fails.
+        if action == _AUTO:  # Landing sequences are not simulated, so the firmware finds none.
             self.warn("Unable to start landing sequence")
             self.warn("Mode change to AUTO RTL failed: No return path or landing sequence found")
             self.warn("Trying RTL Mode")

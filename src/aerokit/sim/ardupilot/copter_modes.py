@@ -104,7 +104,7 @@ class AutoYaw:
         motion = self._copter.motion
         offset = wrap_pi(self._heading - motion.yaw)
         if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
-            motion.turn(self._rate)  # Turn on in the commanded direction until it is the shorter way to the heading.
+            motion.turn(self._rate)  # Keep the commanded direction until it is the shorter way to the heading.
             return
         self._rate = 0.0
         motion.face(self._heading, self._max_rate)

@@ -26,7 +26,7 @@ _REFUSED_FUNCTIONS: dict[Kind, tuple[int, ...]] = {
     "rover": (),
     "sub": (0, _SAVE_WAYPOINT),
 }
-# SERVOn_FUNCTIONs of free outputs: none, and those that pass an RC channel through.
+# Values of SERVOn_FUNCTION for a free output: 0 (no function), and those that pass an RC channel through.
 _FREE_FUNCTIONS = frozenset({0, 1, *range(51, 67)})
 _AUX_POSITIONS = (0.0, 1.0, 2.0)
 

@@ -219,7 +219,7 @@ class FenceList(ItemList):
 
     def _store(self, items: Sequence[MissionItem]) -> None:
         self._items = list(items)
-        # Fewer than three vertices and circles count as 0 (AC_PolyFence_loader.cpp, write_fence).
+        # FENCE_TOTAL is 0 if the fence has fewer than three items other than return points (AC_PolyFence_loader.cpp).
         zone_points = sum(item.command != Cmd.NAV_FENCE_RETURN_POINT for item in items)
         self._on_total(zone_points + 2 if zone_points >= 3 else 0)
 

@@ -52,7 +52,7 @@ class ArduPilotMissionServer(MissionServer):
         """The mission."""
         self.fence: FenceList = FenceList(self._on_fence_total)
         self._fence_total = 0
-        self._was_fence_stored = False  # since the boot
+        self._was_fence_stored = False  # True once a fence was stored since the boot
         self.rally: RallyList = RallyList()
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,
@@ -172,7 +172,7 @@ class ArduPilotMissionServer(MissionServer):
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
-        # `end` may be the index after the last item. This item is appended to the list.
+        # `end` may be the index after the last item. An item with this index is appended to the list.
         if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
             refusal = Result.ERROR

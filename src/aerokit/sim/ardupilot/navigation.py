@@ -269,7 +269,7 @@ class SmartPath:
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
         self._good_at = -math.inf  # time of the last good position
-        self._saved_at = -math.inf  # time at which the path was last not full
+        self._saved_at = -math.inf  # last time at which the path was not full
         self._warned_at = -math.inf
         self._is_started = False  # True after the first `reset`
         self.is_active: bool = False  # True while SMART_RTL is possible.
@@ -315,7 +315,7 @@ class SmartPath:
             if not self._is_started and vehicle.navigation.has_position:
                 self.reset()
             return
-        is_disarmed_copter = vehicle.KIND == "copter" and not vehicle.motors.is_armed  # ArduRover records always.
+        is_disarmed_copter = vehicle.KIND == "copter" and not vehicle.motors.is_armed  # Rovers always record.
         if vehicle.mode.returns_on_path or is_disarmed_copter:
             return
         if not vehicle.navigation.has_position:
@@ -393,11 +393,11 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     dot11, dot12, dot22 = dot_product(line1, line1), dot_product(line1, line2), dot_product(line2, line2)
     dot1, dot2 = dot_product(line1, between), dot_product(line2, between)
     determinant = dot11 * dot22 - dot12 * dot12
-    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # True for a segment without a length.
+    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # also True if a segment has no length
     if are_nearly_parallel:
         return None
-    # The nearest places on the two segments, from 0 (start) to 1 (end). The limits of `share2` change
-    # `share1`, which is therefore calculated twice.
+    # Each share locates the nearest point on its segment, from 0 (start) to 1 (end). Limiting `share2` moves the
+    # nearest point of the first segment, so `share1` is calculated again.
     share1 = max(0.0, min(1.0, (dot12 * dot2 - dot22 * dot1) / determinant))
     share2 = max(0.0, min(1.0, (dot12 * share1 + dot2) / dot22))
     share1 = max(0.0, min(1.0, (dot12 * share2 - dot1) / dot11))

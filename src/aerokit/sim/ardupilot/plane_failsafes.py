@@ -242,7 +242,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self._mode_before: int | None = None  # mode before the last return; None before the first
+        self._mode_before: int | None = None  # mode before the last return; None before the first return
 
     def update(self) -> None:
         super().update()

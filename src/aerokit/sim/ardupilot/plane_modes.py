@@ -62,7 +62,7 @@ class PlaneHost(ArduPilotVehicle):
         """Fly in the take-off direction at cruise speed, and climb as soon as the airspeed suffices."""
         wing = self.wing
         self.lift_off()
-        if wing.is_on_ground:  # Roll straight ahead.
+        if wing.is_on_ground:  # Keep straight ahead until the plane leaves the ground.
             wing.bank_and_climb(self.cruise_m_s, 0.0, wing.wing_limits.climb_m_s)
         else:
             yaw = wing.yaw if self.take_off_yaw is None else self.take_off_yaw
@@ -192,7 +192,7 @@ class PlanePilotedMode(PlaneModeBase):
             wing.roll_out()
             return
         plane.lift_off()
-        climb = self.vehicle.stick(RC_PITCH) * limits.climb_m_s  # A pulled stick has a positive value, and climbs.
+        climb = self.vehicle.stick(RC_PITCH) * limits.climb_m_s  # The value of a pulled stick is positive: a climb.
         if is_idle:  # Without thrust, the plane glides, and a pulled stick has no effect.
             climb = min(climb, 0.0) - limits.glide_sink_m_s
         throttle = max(0.0, min(1.0, (throttle_pulse - 1000) / 1000))

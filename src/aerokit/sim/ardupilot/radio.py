@@ -172,7 +172,7 @@ class SubJoystick(ArduPilotJoystick):
         scale = _SUB_SCALE * gain
         throttle_scale = 2 * scale * parameters.get("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTER - 500 * throttle_scale  # 500 is the middle of the axis z.
-        # The firmware scales neither pitch and roll, nor does it check that the message contains them (joystick.cpp).
+        # The firmware does not scale pitch and roll, and does not check that the message contains them (joystick.cpp).
         offsets = {
             SUB_PITCH: axes.s, SUB_ROLL: axes.t, RC_YAW: axes.r * scale, SUB_FORWARD: axes.x * scale,
             SUB_LATERAL: axes.y * scale,

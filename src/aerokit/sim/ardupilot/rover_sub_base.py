@@ -58,7 +58,7 @@ class GuidedTargetMode(GuidedMode):
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
         self.speed: float = 0.0
-        self._target: GuidedTarget | None = None  # followed while there is no `_place`; None to stop
+        self._target: GuidedTarget | None = None  # followed while `_place` is None; without it, the vehicle stops
         self._target_at = 0.0
 
     def go_to(self, position: Ned) -> None:

@@ -107,7 +107,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
     def _check_pilot(self) -> None:
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
         silence = sub.now - self.radio_received_at
-        is_silent = silence >= sub.parameters["FS_PILOT_TIMEOUT"]  # `silence` is NaN before the first input.
+        is_silent = silence >= sub.parameters["FS_PILOT_TIMEOUT"]  # False before the first input (NaN).
         if not enabled or not is_silent:
             self.is_pilot_lost = False
             return
@@ -168,7 +168,7 @@ class _HullLimit:
     def __init__(self, quantity: str, prefix: str) -> None:
         self.is_exceeded: bool = False
         self._quantity, self._prefix = quantity, prefix
-        self._good_at = 0.0  # time at which the limit was last kept
+        self._good_at = 0.0  # last time at which the value was below the limit
         self._reported_at = 0.0
 
     def update(self, sub: SubHost, value: float) -> None:
@@ -176,7 +176,7 @@ class _HullLimit:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:
             self._good_at = sub.now
-            self._reported_at = sub.now  # The first warning, too, comes only after an interval.
+            self._reported_at = sub.now  # The interval also delays the first warning.
             self.is_exceeded = False
             return
         if sub.now - self._good_at > _HULL_TIMEOUT_S:

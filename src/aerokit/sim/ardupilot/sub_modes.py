@@ -178,7 +178,7 @@ class SubGuided(GuidedTargetMode):
     def set_target(self, target: GuidedTarget) -> None:
         if target.position is not None:
             motion = self.vehicle.motion
-            # As in SITL, a new position starts from rest.
+            # As in SITL, the submarine loses its velocity when it gets a new target position.
             motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0
         super().set_target(target)
         self._heading = target.yaw

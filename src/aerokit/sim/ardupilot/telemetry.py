@@ -215,7 +215,7 @@ def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
         voltages=voltages,
         current_battery=round(battery.current_a * 100),
         current_consumed=round(battery.consumed_mah),
-        energy_consumed=round(battery.consumed_wh * 36),  # 1 Wh is 36 hJ.
+        energy_consumed=round(battery.consumed_wh * 36),  # The field is in hectojoules: 1 Wh is 36 hJ.
         battery_remaining=int(battery.percent),
         time_remaining=0,
         charge_state=charge,

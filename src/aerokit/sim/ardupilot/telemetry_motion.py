@@ -202,7 +202,7 @@ def _home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
         return None
     place = vehicle.navigation.frame.to_global(*home)
     x, y, z = vehicle.navigation.local(home)
-    quaternion = (math.nan,) * 4  # as ArduPilot sends it
+    quaternion = (math.nan,) * 4  # ArduPilot sends NaN, too.
     return m.HomePosition(
         latitude=place.latitude_e7, longitude=place.longitude_e7, altitude=round(place.altitude_m * 1000),
         x=x, y=y, z=z, q=quaternion, approach_x=0.0, approach_y=0.0, approach_z=0.0, time_usec=vehicle.time_boot_us,

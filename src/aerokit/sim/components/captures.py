@@ -108,7 +108,7 @@ class Lens:
     def set_focus(self, kind: int, value: float) -> bool:
         """Apply SET_CAMERA_FOCUS. Return False if the type or the value is not supported."""
         if kind == SetFocusType.METERS and value > 0.0:
-            self.focus.set(100.0 * value / (value + _HALF_RANGE_FOCUS_M))  # 100 % is infinity.
+            self.focus.set(100.0 * value / (value + _HALF_RANGE_FOCUS_M))  # A focus of 100 % is infinity.
         elif kind in _AUTO:
             self.focus.set(_SHARP_PERCENT)
         else:

@@ -138,7 +138,7 @@ class SimulatedComponent:
         vehicle.on_power_on(self._on_vehicle_power_on)
 
     def _on_vehicle_power_on(self) -> None:
-        if math.isnan(self._booted_at):  # A reboot of the vehicle does not reboot its components.
+        if math.isnan(self._booted_at):  # A reboot of the vehicle calls this method, too.
             self.reboot()
 
     def reboot(self) -> None:

@@ -49,7 +49,7 @@ class Px4Calibration:
         self._px4 = px4
         self.side_s: float = math.inf
         self._sensor = ""  # sensor that is being calibrated; empty if none is
-        self._run_number = 0  # number of this calibration; timers of earlier calibrations do nothing
+        self._run_number = 0  # increased by every start, so that timers of earlier calibrations do nothing
 
     @property
     def is_running(self) -> bool:
@@ -196,7 +196,7 @@ class Px4Arming:
         px4 = self._px4
         if px4.is_armed:
             return True
-        # Simulated failures also make `is_ready` False.
+        # Simulated failures are reported (below), even while PX4 is booting.
         is_booting = not px4.is_ready and not px4.faults.prearm_failures
         if is_booting:  # PX4 refuses without a text.
             return False

@@ -32,7 +32,7 @@ class Px4Fence:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._is_valid = True  # False disables the uploaded zones, because they do not allow home
+        self._is_valid = True  # False if home is outside the uploaded zones, which are then ignored
 
     def on_uploaded(self) -> None:
         home_north, home_east, _ = self._px4.home

@@ -231,7 +231,7 @@ class Px4Storage(VehicleStorage):
         sends_param_error = not px4.version.startswith("1.16")
         self.parameters: ParameterServer = Px4ParameterServer(px4, px4.parameters, sends_errors=sends_param_error)
         self.ftp: SessionFtpServer[FileTree] = Px4Ftp(px4, self.files)
-        # Creating and removing a file leaves the folder of the logs, which exists even if there are none.
+        # The folder of the logs exists even if it is empty. To create it, create a file in it and remove the file.
         self.files.put(f"{Px4LogServer.FOLDER}/.keep", b"").clear_folder(Px4LogServer.FOLDER)
         self.logs: LogServer = Px4LogServer(px4, logs, self.files)
         self.limit_rates(link_bytes_per_s, parameters=_LINK_SHARE, files=_LINK_SHARE, logs=_LINK_SHARE)
