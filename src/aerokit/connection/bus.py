@@ -40,7 +40,8 @@ Sink = Callable[[Any], None]
 
 EventT = TypeVar("EventT", bound=Event)
 
-# What a sink is called with. LAZY: sink(frame), or sink(frame, message) if another sink needs the message decoded.
+# How a sink is called. MESSAGE: sink(message). FRAME: sink(frame). LAZY: sink(frame), or sink(frame, message) if
+# another sink needs the message decoded.
 MESSAGE, FRAME, LAZY = range(3)
 MIXED = 3  # The sinks for one message are called with different arguments.
 
@@ -50,8 +51,8 @@ class _Entry(NamedTuple):
     sink: Callable[..., None]
 
 
-# (takes, sinks). The first is MESSAGE or FRAME if all sinks can be called with the same item, otherwise MIXED. No
-# NamedTuple, because unpacking one for each frame would take three times as long.
+# (takes, sinks): `takes` is MESSAGE or FRAME if all sinks can be called with the same argument, otherwise MIXED. This
+# is a plain tuple, because unpacking a NamedTuple for each frame would take three times as long.
 _DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
@@ -239,7 +240,7 @@ class Bus:
 
 
 def _remove_sink(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
-    # A delivery that is in progress still uses the old tuple.
+    # The tuple is replaced, not changed, because a delivery in progress still uses the old one.
     remaining = list(table[key])
     remaining.remove(sink)
     table[key] = tuple(remaining)

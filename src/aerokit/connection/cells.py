@@ -321,8 +321,8 @@ class Changes(AsyncIterator[T]):
         cell._add_iterator()  # From now on, every message of the cell is decoded.
         self._cell = cell
         self._every_arrival = every_arrival
-        # Value of `_total()` when this iterator last returned a value. The iteration starts with the current value, so
-        # this value counts as not returned.
+        # Value of `_total()` when this iterator last returned a value. The iteration starts with the cell's current
+        # value, which therefore counts as not returned.
         self._read_count = self._total() - (1 if cell.is_known else 0)
         self._missed = 0
 

@@ -544,7 +544,7 @@ class Connection:
         """End the connection. All waiters and later calls raise ``error``. Idempotent."""
         if not self.is_open:
             return
-        self._end_signal.error = error  # Set first: sinks of the events below must find the connection closed.
+        self._end_signal.error = error  # Set first, because sinks of the events below must find it closed.
         self._receiver.close()
         self._observers.flush()  # The task that flushes regularly ends below, and the program may run on for hours.
         # Only a lost link is published as an event: a program that closes the connection itself needs none.

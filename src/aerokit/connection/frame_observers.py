@@ -54,8 +54,8 @@ class Recording:
         self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
         self._writer: TlogWriter | None = None  # None while frames wait (see `_waiting`) and after the end
         self._file: BinaryIO | None = None  # the file of the writer
-        # Frames sent before the first received frame, at which an existing file is renamed. None if there was no such
-        # file, and after that frame.
+        # Sent frames that wait for the first received frame, because only then an existing file is renamed and the new
+        # file is opened. None if no file existed, and after the first received frame.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.

@@ -26,7 +26,8 @@ MIN_IDLE_ITERATIONS = 3
 
 MAX_SLEEPS = 16
 
-# Platform → (clock that includes suspended time, clock of the loop). On Windows, the loop's clock includes it.
+# Maps each platform to its clock that includes suspended time, and to the clock of the loop. On Windows, the loop's
+# clock itself includes suspended time.
 CLOCKS = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
@@ -189,7 +190,7 @@ class LoopWatch:
             caught_up_after_s = self._loop.time() - self.oldest_arrival
             self.oldest_arrival = math.inf
             self.late_after = self._ran_at + CHECK_INTERVAL_S / 2
-            self._on_caught_up(caught_up_after_s)  # last, because it may close the watch
+            self._on_caught_up(caught_up_after_s)  # This comes last, because it may close the watch.
 
 
 IPYTHON_HINT = (

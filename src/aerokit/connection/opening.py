@@ -232,7 +232,7 @@ def _target_key(target: Link | LinkAddress) -> object:
     )
     if gets_new_endpoint:
         return None
-    # On zenoh networks, the same name with other endpoints is another vehicle.
+    # On zenoh, the same name on a network with other endpoints is another vehicle.
     endpoints = [(name, value) for name, value in target.options if name in ("connect", "listen")]
     return target.kind, target.host, target.port, target.device, target.path, tuple(endpoints)
 

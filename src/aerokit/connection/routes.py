@@ -44,10 +44,10 @@ class OtherPeer:
     )
 
     def __init__(self) -> None:
-        self._expected: int | None = None  # next sequence number of the route's peer when this peer began to send
+        self._expected: int | None = None  # `expected` in the last call of `add`; None before the first call
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
-        # Number of frames since the last frame from the route's own peer, and the time of the first of them.
+        # Number of this peer's frames since the last frame of the route's peer, and the time of the first of them.
         self._frames, self._began_at = 0, 0.0
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
@@ -302,7 +302,7 @@ class Routes:
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         before, route.peer = route.peer, peer
-        # The frame counts as a heartbeat, so that the new peer has time for its first one.
+        # The frame counts as a heartbeat, so that the new peer has time to send its first heartbeat.
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id

@@ -103,7 +103,7 @@ class SignatureFilter:
                 # reported nor counted as refused.
                 return signing.may_be_unsigned(frame)
             refusal = signing.check(frame, self._unix_time())
-        except Exception:  # from `allow_unsigned`, a function of the program; nothing else here or above raises
+        except Exception:  # Only `allow_unsigned`, a function of the program, can raise here.
             logger.exception("the check of a frame by %r raised an exception; the frame was refused", signing)
             return False
         if refusal is not None and refusal not in self._reported:

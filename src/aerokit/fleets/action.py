@@ -81,7 +81,7 @@ class _SentOrders(NamedTuple):
     """Orders that this program has sent to a member until some time."""
 
     newest: Order | None  # the newest order that moves the vehicle
-    command_count: int  # number of commands to disarm; for an action that arms, to arm
+    command_count: int  # number of disarm commands; for an action that arms, number of arm commands
 
 
 class FleetAction:
@@ -226,8 +226,8 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                # The value of `FleetContext.newest_orders` while no newer action moves the member. An action that was
-                # created meanwhile then counts as a newer order.
+                # `FleetContext.newest_orders` returns this value while no newer action moves the member. An action that
+                # was created meanwhile therefore counts as a newer order.
                 self._final_orders[member.name] = _newest_order(member), self
                 member.record_success()
         finally:
@@ -238,7 +238,7 @@ class FleetAction:
         """Wait until the member may start. Raises OperationRejected or HeartbeatTimeout if it must not start."""
         before = self._orders_before.get(member.name) or self._orders_of(member)
         is_overruled = False
-        if self._moves_members or self._kind is ActionKind.ARMS:  # Other actions are checked only after a delay.
+        if self._moves_members or self._kind is ActionKind.ARMS:  # All other kinds are checked only after a delay.
             # A landing without a delay is sent even if there is a newer action, because that action may fail.
             has_newer_action = not self._ends_flight and self._has_newer_action(member)
             is_overruled = has_newer_action or self._has_order_since(member, before)

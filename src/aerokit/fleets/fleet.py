@@ -159,7 +159,7 @@ class Fleet(Selection):
         def attach(sink: Sink) -> list[Detach]:
             detachments: list[Detach] = []
             for event_type in event_types:
-                # The fleet's bus has only the fleet's own events. Those of vehicles arrive on the buses of their links.
+                # The fleet's bus has only the fleet's own events. Each connection's bus has the events of its vehicles.
                 is_fleet_event = issubclass(event_type, FleetEvent) and event_type is not MemberEvent
                 if is_fleet_event or event_type is Event:
                     detachments.append(self._context.bus.attach_event(event_type, sink))

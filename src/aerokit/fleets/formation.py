@@ -292,7 +292,7 @@ class Following:
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
         velocity = self._leader.vehicle.velocity.latest
-        leader_velocity = (0.0, 0.0, 0.0)  # while the velocity is unknown
+        leader_velocity = (0.0, 0.0, 0.0)  # An unknown velocity counts as zero.
         if velocity is not None:
             leader_velocity = velocity.north_m_s, velocity.east_m_s, -velocity.down_m_s
         north, east, up = follow_velocity(

@@ -42,8 +42,8 @@ TooCloseAction = Literal["hold", "report"]
 """The fleet's reaction if two members come too close to each other in flight."""
 Source = str | Link | Connection | Vehicle
 
-DISCOVERY_S = 2.5  # long enough for two heartbeats at 1 Hz, because one may be lost
-HEARTBEAT_MAX_AGE_S = 10.0  # a vehicle of an open connection that was silent for longer has left
+DISCOVERY_S = 2.5  # In this time, two heartbeats arrive at 1 Hz, of which one may be lost.
+HEARTBEAT_MAX_AGE_S = 10.0  # On an open connection, a vehicle that was silent for longer counts as gone.
 WAIT_WARNING_S = 5.0
 
 

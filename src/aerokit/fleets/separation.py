@@ -177,7 +177,7 @@ def separate_by_time(
     for _ in routes:  # at most one try for each route
         delays = _delays(sequence, resting, min_distance_m, speed_m_s, slack_s=slack_s, max_delay_s=max_delay_s)
         if not isinstance(delays, _Blocked):
-            delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
+            delays = {route.name: delays[route.name] for route in routes}  # Restore the sequence of `routes`.
             max_s = max(delays.values())
             reason = f"{describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
             return Deconfliction(

@@ -85,7 +85,7 @@ class Show(Snapshot):
         for name, points in tracks.items():
             try:
                 parsed[name] = Path(name, [PathPoint(*map(float, point)) for point in points])
-            except (TypeError, ValueError, OverflowError) as error:  # OverflowError: a whole number of 400 digits
+            except (TypeError, ValueError, OverflowError) as error:  # A number of 400 digits raises OverflowError.
                 raise InvalidArgument(f"track {name!r}: {error}") from None
         return cls(parsed)
 
@@ -113,7 +113,7 @@ class Show(Snapshot):
         reader = csv.reader(io.StringIO(text))
         try:
             rows = [(reader.line_num, row) for row in reader]
-        except csv.Error as error:  # e.g. a quote that never ends
+        except csv.Error as error:  # For example, a quote never ends.
             raise InvalidArgument(f"line {reader.line_num}: {error}") from None
         _, header = rows.pop(0) if rows else (0, [])
         if [cell.strip() for cell in header] != COLUMNS:

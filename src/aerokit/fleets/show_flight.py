@@ -100,7 +100,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
         if sent_at is None:
             return
         round_trip_s = frame.received_at - sent_at
-        answered_at = sent_at + round_trip_s / 2  # if both directions take the same time
+        answered_at = sent_at + round_trip_s / 2  # Both directions are assumed to take the same time.
         offset_s = message.tc1 / 1e9 - answered_at
         measurements.append((round_trip_s, offset_s))
 

@@ -227,7 +227,7 @@ class Travel(SelectionBase):
         moving = [members[name] for name in targets if members[name].is_available]
         if not moving:
             return [], {}
-        origin = LocalOrigin(targets[moving[0].name])  # The targets stay the same while the members move.
+        origin = LocalOrigin(targets[moving[0].name])  # Unlike the members, the targets do not move.
         routes = [
             Route(
                 member.name,
@@ -356,7 +356,7 @@ class Missions(SelectionBase):
         async def upload(member: Member) -> None:
             async with slots[member.network]:
                 newest = self._context.newest_upload
-                if newest is not missions and member.name in newest:  # This upload may replace the newer one's mission.
+                if newest is not missions and member.name in newest:  # This upload may replace the newer mission.
                     self._context.newest_upload = {}
                     self._context.missions.clear()
                 await member.vehicle.mission.upload(

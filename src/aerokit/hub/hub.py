@@ -207,7 +207,7 @@ class Hub:
         self._running_endpoints[running.name] = running
         try:
             await running.open()
-        except BaseException as error:  # including a cancellation of this call
+        except BaseException as error:  # A cancellation of this call is included.
             will_retry = endpoint.retry_open and isinstance(error, LinkError)
             if not will_retry:
                 if self._has(running):

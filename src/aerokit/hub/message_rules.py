@@ -154,7 +154,8 @@ _ORDERS = (
 )  # fmt: skip
 
 
-# An estimator that gets an old measurement misplaces the vehicle. Vehicles send some of these messages as telemetry.
+# Old measurements are dropped, because the estimator would misplace the vehicle. Vehicles send some of these messages
+# as telemetry, too.
 _MEASUREMENTS = frozenset(
     (
         "GPS_INPUT", "ODOMETRY", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "GLOBAL_VISION_POSITION_ESTIMATE",

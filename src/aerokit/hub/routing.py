@@ -136,7 +136,7 @@ class Router(Generic[PortT]):
         self._senders: dict[int, Sender] = {}  # by system id + 256 · component id
         self._recent = RecentFrames()
         self._newest_port = 0  # number of the last created port
-        self._without_heartbeat: dict[int, None] = {}  # senders that may be noise, as keys in order
+        self._without_heartbeat: dict[int, None] = {}  # keys: senders without a HEARTBEAT, oldest first
         self._swept_at = -math.inf  # time of the last removal of silent senders
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
@@ -197,8 +197,8 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # The first item of a record is the port of the earlier frame. A frame from the same port is no copy:
-                # its sequence number and checksum are equal by chance.
+                # The first item of a record is the port of the earlier frame. A frame from the same port is no copy,
+                # because its sequence number and checksum are equal by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == port_number:
                     newer[identity] = record
                     plan.sender.received_at = now
@@ -363,11 +363,11 @@ class Router(Generic[PortT]):
         if len(ingress.plans) >= MAX_PLANS:
             ingress.forget_plans()
         plan = self._make_plan(ingress, key)
-        if plan.reason:  # This plan is not cached, because a sender could fill the cache with unknown targets.
+        if plan.reason:  # Not cached, because a sender could fill the cache with unknown targets.
             return plan
         system_id, _ = plan.target
         if system_id and any(sender.may_become_vehicle for sender in self._senders_of(system_id)):
-            return plan  # It changes without a call of `forget_plans` when the sender is no longer new.
+            return plan  # Not cached: the plan changes without `forget_plans` when the sender is no longer new.
         ingress.plans[key] = plan
         # The fast path of `route_all` is only for messages without a target. Heartbeats, and frames at another port
         # than the sender's, may change the data about the sender, so `route` must process them.
@@ -392,7 +392,7 @@ class Router(Generic[PortT]):
                 return ForwardingPlan(stream_key, message_id, ids, reason="no_route")
         elif self._targets.is_command(message_id):
             numbers = [number for number in numbers if not self._is_redundant(number, sender)]
-        # Any autopilot would adapt its message rates to this radio, even if the radio is not its own.
+        # The radio's status is not sent to autopilots, because an autopilot adapts its message rates to any radio.
         if message_id in _RADIOS:
             numbers = [number for number in numbers if not self._has_autopilot(number)]
         outs, rate_limited = [], []

@@ -169,7 +169,7 @@ class RunningEndpoint:
             if frames:
                 port = self._ports.get(port_peer) or self._add_port(port_peer)
                 self._switch.receive(port, framer, frames, data if is_whole else None, now, arrived_at)
-                if port_peer != peer:  # A peer of a udpbcast link has answered the broadcast: send to this peer only.
+                if port_peer != peer:  # A peer of a udpbcast link has answered, so send to it only.
                     self.link.keep_peer(peer)
         except Exception as error:
             self._report(self, "internal_error", f"internal error of aerokit: {error!r}")

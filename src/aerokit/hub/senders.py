@@ -183,7 +183,7 @@ class IdentityGuard:
         self._report = report
         self._heartbeat_at: dict[Peer, float] = {}  # time of the last heartbeat of each peer
         self._reported_at: dict[str, float] = {}  # sender, e.g. "1/1" → time of the last event about it
-        self._current_peer: Peer = None  # sender of the frame that is being checked
+        self._current_peer: Peer = None  # peer that sent the frame that is being checked
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
         """Return True if this peer may send this frame.

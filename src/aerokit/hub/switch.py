@@ -95,7 +95,7 @@ class Switch:
         return watch.arrival_time(now) if now > watch.late_after else now
 
     def _exclude_pause(self, paused_s: float) -> None:
-        # Nothing was read during the pause, so it is no silence of senders.
+        # Nothing was read during the pause, so it does not count as silence of the senders.
         now = self._clock()
         self.router.exclude_pause(now, paused_s)
         for guard in {port.guard for port in self.router.ports if port.guard is not None}:

@@ -135,7 +135,7 @@ _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000
 def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
     """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
-    forms: list[str] = []  # with a letter for each field
+    forms: list[str] = []  # Each form has a letter for each field.
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         forms += _ARDUPILOT_FORMS.get(item.command, ("",))
     if storage in (ItemStorage.PX4, ItemStorage.ANY):
@@ -183,19 +183,19 @@ def _finite_stored_as(letter: str, value: float) -> float | None:
             (stored,) = struct.unpack("<f", struct.pack("<f", value))
     elif letter == "c":  # limited to 0..255
         stored = float(max(0, min(255, whole)))
-    elif letter == "U":  # 16 bits that wrap
+    elif letter == "U":  # 16 bits, which wrap around
         stored = float(whole & 0xFFFF)
-    elif letter == "y":  # heading
+    elif letter == "y":  # heading from 0 to 360
         stored = value % 360.0
-    elif letter == "k":  # centimetres
+    elif letter == "k":  # whole centimetres
         stored = math.trunc(value * 100.0) / 100.0
     elif letter == "h" and abs(value) <= 65_504:  # 16-bit float, whose maximum is 65504
         (stored,) = struct.unpack("<e", struct.pack("<e", value))
     elif letter == "n":  # at most 255; below 1 in steps of 1/256
         stored = math.trunc(value * 256.0) / 256.0 if 0 < value < 1 else float(min(255, whole))
-    elif letter == "r":  # metres
+    elif letter == "r":  # whole metres
         stored = float(whole)
-    elif letter == "R":  # metres in a byte, above 255 m in tens
+    elif letter == "R":  # one byte: whole metres up to 255 m, tens of metres above
         radius = math.trunc(abs(value)) if abs(value) <= 255 else 10 * min(255, math.trunc(abs(value) / 10))
         stored = math.copysign(radius, value)
     return stored
@@ -313,7 +313,7 @@ def _same_place(
     value, actual_value = getattr(expected, field), getattr(actual, field)
     scale = xy_scale(expected.command, expected.frame)
     if scale != 1:
-        tolerance = 1.0  # for rounding, in units of x and y
+        tolerance = 1.0  # Rounding may change x or y by one unit.
         if single_precision:
             tolerance += _float_step(value / scale) * scale
         return bool(abs(value - actual_value) <= tolerance)

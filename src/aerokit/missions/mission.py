@@ -99,7 +99,7 @@ class Mission(_ItemSequence):
         return cls(*without_home(items)) if home_is_item_0 else cls(items)
 
 
-# Maps `inclusion` to the command.
+# Maps the argument `inclusion` to the command of a polygon.
 _POLYGON = {True: MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, False: MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION}
 
 _CIRCLE = {True: MavCmd.NAV_FENCE_CIRCLE_INCLUSION, False: MavCmd.NAV_FENCE_CIRCLE_EXCLUSION}

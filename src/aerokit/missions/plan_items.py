@@ -205,7 +205,7 @@ def _jump_ids(entries: Sequence[_Entry]) -> dict[int, int]:
             else:
                 ids_in_surveys.setdefault(jump_id, index)
         first += entry.size
-    # If an item inside a survey has the same id as an item with an entry of its own, the latter is used.
+    # If an item inside a survey and an item with an entry of its own have the same id, the item with the entry is used.
     return ids_in_surveys | ids_of_entries
 
 

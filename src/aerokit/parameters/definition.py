@@ -365,7 +365,7 @@ class _Reader:
     def __init__(self, root: Element) -> None:
         self._root = root
         nodes = list(root.iterfind("parameters/parameter"))
-        # Reversed, because the first definition counts if a setting is defined several times.
+        # The order is reversed, so that the first definition counts if a setting is defined several times.
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:

@@ -136,7 +136,7 @@ def parameter_file_text(
         raise InvalidArgument(
             f"format = {format!r} is not allowed: it must be missionplanner, mavproxy or qgroundcontrol"
         )
-    rows = sorted(_rows(values))  # by name, which is unique
+    rows = sorted(_rows(values))  # The names are unique, so the rows are sorted by name.
     if not rows:
         raise InvalidArgument("there are no parameters to write")
     lines: list[str] = []

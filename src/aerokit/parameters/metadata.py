@@ -82,7 +82,7 @@ class ParameterMetadata(Snapshot):
         low, high = self.minimum, self.maximum
         is_inside = (low is None or value >= low) and (high is None or value <= high)
         has_range = low is not None or high is not None
-        # If a range or bits are documented too, the documented values are only examples.
+        # If a range or bits are documented as well, the documented values do not exclude others.
         allows_other_values = has_range or not self.values or bool(self.bitmask)
         if value in self.values or (is_inside and allows_other_values):
             return None

@@ -254,7 +254,7 @@ def _encode_entry(name: bytes, previous_name: bytes, code: int, *values: float) 
 
 def _common_length(name: bytes, previous_name: bytes) -> int:
     """Return the length of the prefix that a name shares with the previous name."""
-    # The name's last character is never shared, because the format requires at least one own character.
+    # The last character of the name is never shared, because the format requires at least one own character.
     common = 0
     for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the lengths may differ
         if char != previous_char:

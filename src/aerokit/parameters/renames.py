@@ -244,7 +244,7 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
                 rename = rename.replace(other_old=(*rename.other_old, old))
             two_way.update(dict.fromkeys(rename.names, rename))
     by_name: dict[str, tuple[Rename, ...]] = {name: (rename,) for name, rename in two_way.items()}
-    # These renames are found only by the old name.
+    # The renames in ONE_WAY are found only by the old name.
     for since, vehicles, divisor, pairs in rename_table.ONE_WAY:
         for old, new in _pairs(pairs):
             rename = Rename(old, new, divisor, vehicles=vehicles, since=since)

@@ -339,7 +339,7 @@ def memory_link_pair(*, latency_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]
 
 class _Arrival(NamedTuple):
     due: float
-    data: bytes | None  # None if the far end was closed
+    data: bytes | None  # None means that the far end was closed
 
 
 class MemoryLink(BaseLink):

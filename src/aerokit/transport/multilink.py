@@ -70,7 +70,7 @@ class MultiLink(Link):
         """Indices of links that are used only when the others fail."""
         self._members = [_Member(self, index, make_link) for index, make_link in enumerate(factories)]
         self._survives_loss = survives_loss
-        self._receiver: Receiver | None = None  # None before the opening and after the end, when no callback runs
+        self._receiver: Receiver | None = None  # None before open() and after the end; no callback is called then
         self._was_opened = self._is_closed = False
         self._openings: set[asyncio.Task[None]] = set()  # tasks that retry links which could not be opened
         self._is_opening = False  # True while open() runs

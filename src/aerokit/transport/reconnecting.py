@@ -86,7 +86,7 @@ class ReconnectingLink(Link):
         self._make_link = make_link
         self._link = make_link()
         self._backoff = Backoff(min_delay_s, max_delay_s)
-        self._receiver: Receiver | None = None  # None before the opening and after the end, when no callback runs
+        self._receiver: Receiver | None = None  # None before open() and after the end; no callback is called then
         self._current: _CurrentReceiver | None = None  # receiver of the current link; earlier links are ignored
         self._was_opened = self._is_closed = False
         self._is_up = False  # True while the current link is open

@@ -250,7 +250,7 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
         raise  # The transport itself retries a write that would block.
     except OSError as error:
         on_failure(error)
-        return len(data)  # Report the data as written, so that the transport does not retry: the link is closed soon.
+        return len(data)  # The data counts as written, because the link is closed soon and a retry is useless.
 
 
 def _open_error(address: str, error: Exception) -> OSError:

@@ -85,7 +85,7 @@ def make_readable_check(sock: socket.socket) -> Callable[[], object]:
     """Return a function that tells whether data can be read."""
     if sys.platform == "win32":  # Windows has no poll(), so a read is always attempted.
         return lambda: True
-    # The check takes a third of the time of a failed read.
+    # This check takes a third of the time that a failed read takes.
     poll = select.poll()
     poll.register(sock, select.POLLIN)
     return partial(poll.poll, 0)

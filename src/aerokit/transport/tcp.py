@@ -141,7 +141,7 @@ class TcpConnect(_TcpLink):
         try:
             await loop.create_connection(lambda: stream, sock=sock)
         except BaseException:
-            self._stream = None  # Without this, closing the stream would count as the loss of an open link.
+            self._stream = None  # Otherwise, closing the stream would count as the loss of an open link.
             stream.close()
             # After a failure, uvloop neither closes the socket nor calls `connection_lost`, which removes the stream.
             sock.close()
@@ -363,8 +363,8 @@ class _Stream(asyncio.Protocol):
             self._outbox.pause()
 
     def resume_writing(self) -> None:
-        # The outbox resumes in a later loop iteration. If a write fails inside this callback, asyncio ends the
-        # connection twice, and the second time raises an AttributeError.
+        # The outbox resumes in a later loop iteration. Otherwise, a write could fail inside this callback, and asyncio
+        # would end the connection twice, the second time with an AttributeError.
         if self._outbox is not None:
             self._loop.call_soon(self._outbox.resume)
 

@@ -288,7 +288,7 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         """Return True if datagrams from ``source``, which is not the present peer, may be delivered."""
         host, *_ = source
-        # Another port of the same host need not wait for silence if a `PeerKeeper` checks its frames.
+        # If a `PeerKeeper` checks the frames, another port of the same host is accepted without a silence of `_remote`.
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 

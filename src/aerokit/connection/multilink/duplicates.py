@@ -40,8 +40,8 @@ class ReceivedFrame:
         self.is_admitted: bool = False
         """True if a copy has passed the signature check."""
         self.is_delivered: bool = False
-        # Bit sets of the links over which copies arrived. `_route_peer_links` counts only the peer that gets our
-        # messages to the sender, because another peer may be a second sender with the same ids.
+        # Bit sets of the links over which copies arrived. `_route_peer_links` has only those from the peer to which the
+        # sender's route leads, because another peer may be a second sender with the same ids.
         self._links = 1 << link
         self._route_peer_links = 0 if is_other_peer else self._links
 

@@ -255,7 +255,7 @@ class LinkChoice:
             for candidate in self.candidates.values():
                 candidate.on_reboot()
         elif self.clock.was_paused:
-            # While a simulation was paused, its answers over other links also mismatched. Forget these mismatches.
+            # While a simulation was paused, its answers over other links did not match either. Forget these mismatches.
             for candidate in self.candidates.values():
                 candidate.reset_mismatches()
 

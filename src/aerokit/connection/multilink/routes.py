@@ -322,7 +322,7 @@ class MultiLinkRoutes:
         for options in sorted(options_by_system, key=len):
             if not any(peers.issuperset(option) for option in options):
                 peers.update(options[0])
-        # Links over which no system is known are added as well.
+        # Links without a known system are added as well, because they may lead to a system that is not known yet.
         links_with_systems = {link for choice in self._choices.values() for link in choice.candidates}
         peers.update(LinkPeer(link, None) for link in range(len(self._routes)) if link not in links_with_systems)
         return peers

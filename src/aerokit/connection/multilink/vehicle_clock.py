@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MAX_SAMPLES = 20
 MIN_TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
-MAX_DRIFT_S = 0.5  # Limits the tolerance, which grows during a silence, so that not every clock matches in the end.
+MAX_DRIFT_S = 0.5  # The tolerance grows during a silence. Without this limit, every clock would match in the end.
 # A measured clock rate of 1 ± this value counts as 1. During a long silence, a small error of the measured rate would
 # add up to a large error of the clock.
 REAL_TIME_TOLERANCE = 0.05
@@ -43,12 +43,12 @@ class VehicleClock:
         self.was_paused: bool = False
         """True if the last sample showed a pause of a simulation, or a change of its speed."""
         self._rate_before: float | None = None  # clock rate before the last pause or reboot
-        self._interrupted_at = -math.inf  # time of the first sample after it, on our clock
+        self._interrupted_at = -math.inf  # time of the first sample after that pause or reboot
 
     def add(self, sample: ClockSample) -> bool:
         """Add a sample from the link in use. Return False if the vehicle rebooted."""
         continues = not self._samples or self._continues(sample)
-        is_unexpected = self._fits(sample) is False  # None: the rate is not known yet
+        is_unexpected = self._fits(sample) is False  # `_fits` returns None while the rate is unknown.
         self.was_paused = continues and is_unexpected
         if is_unexpected or not continues:
             if (rate := self._measured_rate) is not None:

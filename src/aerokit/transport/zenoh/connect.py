@@ -183,7 +183,7 @@ class ZenohConnect(NetworkLink):
         if self._tracker.mode == "take":
             if beacon.lease_holder == self.client:
                 self._tracker.mode = "free"
-            # An empty datagram requests control: with mode "take" until this client has it, then once with "free".
+            # An empty datagram carries the requested mode: "take" until this client has control, then "free" once.
             self._put(b"")
 
     def _on_notice(self, data: bytes, _attachment: bytes) -> None:

@@ -225,7 +225,7 @@ class ClientFilter:
 
 class _LastNotice(NamedTuple):
     sent_at: float
-    unreported: int  # number of messages that were refused since then
+    unreported: int  # number of messages that were refused since `sent_at`
 
 
 def _framer() -> Framer:

@@ -222,7 +222,7 @@ class ZenohListen(NetworkLink):
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        # The next beacon is sent earlier, so that the client need not wait.
+        # Send the next beacon earlier, because the new client waits for one.
         if self._get_or_add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())

@@ -199,7 +199,7 @@ def close_session(session: Any, closed: Callable[[], object] = lambda: None) -> 
     """Close a session on a thread, and then call ``closed()``."""
 
     def work() -> None:
-        with contextlib.suppress(Exception):  # If close() raises, the session is closed all the same.
+        with contextlib.suppress(Exception):  # The session is closed even if close() raises.
             session.close()
 
     try:  # Closing may block.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.calibration.values import CalibrationReport, CalibrationStep
 
 CANCEL_ALL = CancelCommand(MavCmd.PREFLIGHT_CALIBRATION, (0, 0, 0, 0, 0, 0, 0))
-ALL_COMPASSES = 0  # as a bit mask
+ALL_COMPASSES = 0  # In the commands' bit masks of compasses, 0 selects all of them.
 REPORT_HZ = 4.0
 # Value of ESC_CALIBRATION with which ArduCopter calibrates the ESCs at its next boot.
 CALIBRATE_AT_BOOT = 3
@@ -65,7 +65,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
         # Without `every_arrival`, a text that equals the previous one would not be reported.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
 
-        def has_ended_silently() -> bool:  # `run.wait` calls it repeatedly, so it sees every state.
+        def has_ended_silently() -> bool:  # `run.wait` calls this repeatedly, which updates the time.
             nonlocal last_calibrating_at
             if telemetry.system_status.latest == MavState.CALIBRATING:
                 last_calibrating_at = now()
@@ -174,7 +174,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     await run.begin(CancelCommand(MavCmd.DO_CANCEL_MAG_CAL, (ALL_COMPASSES,)))
     percents: dict[int, int] = {}  # progress in percent by number of the compass
     reports: dict[int, MagCalReport] = {}  # final report by number of the compass
-    has_news = asyncio.Event()  # set when a report or another progress has arrived
+    has_news = asyncio.Event()  # set when a report or a changed progress has arrived
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
     def on_message(message: MagCalProgress | MagCalReport) -> None:

@@ -195,7 +195,7 @@ class CalibrationRun:
             for attempt in range(MAX_CANCEL_ATTEMPTS):
                 was_sent_by_abandon = attempt == 0 and self._cancel_sent_at is not None
                 if not was_sent_by_abandon:
-                    # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
+                    # Nothing is sent to a silent vehicle, so wait until it has sent a HEARTBEAT after the last attempt.
                     await self.session.wait_for_heartbeat(self._cancel_sent_at)
                     if self._has_rebooted:  # The reboot has ended the calibration.
                         self._is_unconfirmed = False

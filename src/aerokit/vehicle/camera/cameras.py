@@ -73,7 +73,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         information: CameraInformation | None = None
         with anyio.move_on_after(timeout) as scope:
             information = await self._link.identify()
-        if information is None:  # After the time-out, or because an autopilot has no information about its camera.
+        if information is None:  # The time-out has expired, or an autopilot has no information about its camera.
             limit = f" within {timeout:g} s" if scope.cancelled_caught else ""
             raise self._link.timeout_error(f"did not identify itself{limit}")
         return information
@@ -193,8 +193,8 @@ class Cameras:
         self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
-        # Captures of cameras attached to the autopilot, as message and decoded capture, kept until it is known which
-        # camera is the first.
+        # Messages of cameras attached to the autopilot, each with its decoded capture. They are kept until it is known
+        # which camera is `first`.
         self._early_captures: list[tuple[Any, Capture]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
@@ -268,7 +268,7 @@ class Cameras:
             # If the list is full, a new capture replaces the last one.
             del self._early_captures[MAX_EARLY_CAPTURES - 1 :]
             self._early_captures.append((message, capture))
-        else:  # `at` may create the camera now, after this message.
+        else:  # `at` creates the camera only now, so it has not received this message.
             self.at(number)._log.record(message, capture)
 
     def _process_early_captures(self) -> None:

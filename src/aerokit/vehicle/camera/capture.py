@@ -39,7 +39,7 @@ UNIX_TIME_OF_1990_S = 631_152_000
 # End of the year 9999, the last year that datetime can represent.
 MAX_UTC_S = 253_402_300_799
 
-# A position or an attitude older than this many seconds is not that of a picture taken now.
+# A position or an attitude older than this many seconds is not used for a picture that is taken now.
 MAX_POSE_AGE_S = 2.0
 
 # CAMERA_FEEDBACK counts pictures in 16 bits.

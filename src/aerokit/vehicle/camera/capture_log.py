@@ -33,7 +33,7 @@ DUPLICATE_WINDOW_S = 10.0
 REORDER_WINDOW_MS = 5000
 # If an index exceeds the reported count by more than this, the camera's numbering does not follow the standard.
 MAX_COUNT_LEAD = 100
-# If an index is higher than the highest one by more than this, it counts as corrupt until the next picture confirms it.
+# If an index exceeds the highest one so far by more than this, it counts as corrupt until the next picture confirms it.
 MAX_INDEX_GAP = 1000
 # If an index is lower than the previous one by more than this, the 16-bit counter of CAMERA_FEEDBACK has wrapped.
 HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
@@ -93,10 +93,9 @@ class CaptureLog:
         self._highest: _Entry | None = None  # the entry with the highest plausible index
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
         self._failed: _Entry | None = None  # the last failed picture
-        # Number of pictures according to CAMERA_CAPTURE_STATUS and to indices, and the time since boot at which the
-        # camera reported it. The number stays 0 for a camera that always reports 0.
+        # Number of pictures taken, from CAMERA_CAPTURE_STATUS or an index; 0 for a camera that always reports 0.
         self._count = 0
-        self._count_boot_ms = 0
+        self._count_boot_ms = 0  # the camera's time since boot when it last reported the number
         self._has_nonzero_count = False
         # Time of the event loop at the last reset. Captures from before the reset do not belong to this log.
         self.reset_at: float = -math.inf
@@ -123,7 +122,7 @@ class CaptureLog:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None  # PX4's trigger cannot send a capture again.
-        self._requested.append(index)  # `_shows_reset` does not take the low index of the answer for a reset.
+        self._requested.append(index)  # `_shows_reset` must not take the low index of the answer for a reset.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index):
@@ -170,9 +169,9 @@ class CaptureLog:
         if isinstance(message, m.CameraImageCaptured):
             self._has_images = True
             self._add(message, capture)
-        elif isinstance(message, m.CameraFeedback):  # Its index has 16 bits, so it may return to 0.
+        elif isinstance(message, m.CameraFeedback):
             # Before the first picture, ArduPilot sends a message of zeros, which is not a capture. An index of 0
-            # belongs to a picture only if the indices may have returned to 0.
+            # belongs to a picture only if the 16-bit index may have returned to 0.
             may_have_wrapped = self._highest is not None and self._highest.capture.index > HALF_RANGE
             is_capture = message.img_idx > 0 or may_have_wrapped
             if is_capture and message.cam_idx + 1 == self._link.number:

@@ -136,7 +136,7 @@ class CameraLink(CameraOrders):
         component_id = self.session.component_id if number in AUTOPILOT_CAMERA_IDS else number
         self._component = self._component_of(component_id)
         self._heartbeat_at = self.session.connection.last_heartbeat_at(self.session.system_id, component_id)
-        # What is known so far is about the camera that was guessed.
+        # Refusals and values so far are about the camera that was guessed.
         self._forget_refusals()
         for cell in self._cells:
             cell.forget()
@@ -163,7 +163,7 @@ class CameraLink(CameraOrders):
                 # Another call may have received the information while this call waited for the lock.
                 asked_number: int | None = None
                 while self._needs_information() and not self.is_trigger and self.number != asked_number:
-                    # During the request, another camera may be found, if the number so far was only a guess.
+                    # If the number is a guess, another camera may be found during the request, and is then asked.
                     asked_number = self.number
                     await self._request_information()
         return self.information.latest
@@ -259,7 +259,7 @@ class CameraLink(CameraOrders):
         def on_message(message: Any) -> None:
             frame = message.received_frame
             if frame is not None and frame.component_id == component_id and self._is_from_this_camera(message):
-                # An autopilot without a camera also sends HEARTBEAT, and PX4 STORAGE_INFORMATION about its own card.
+                # Other messages do not prove that there is a camera: PX4 sends STORAGE_INFORMATION about its own card.
                 if message_type.NAME.startswith("CAMERA_"):
                     self._is_number_confirmed.set()
                 callback(message)

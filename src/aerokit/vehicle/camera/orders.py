@@ -159,7 +159,7 @@ class CameraOrders:
                     attempts=attempts,
                     **options,
                 )
-                self._is_number_confirmed.set()  # A camera that accepts a command exists.
+                self._is_number_confirmed.set()  # The accepted command shows that this camera exists.
             except CommandRejected as error:
                 # The status texts with the reasons may arrive after the answer.
                 await session.wait_for_status_texts()
@@ -189,10 +189,9 @@ class CameraOrders:
             except CommandTimeout as error:
                 error.was_sent = error.was_sent or attempt > 1
                 had_effect = await check_effect() if order.is_newest else None
-                # A newer order may have been given while the camera was asked.
-                if (
-                    not order.is_newest or self.session.watch.reboots != reboots
-                ):  # After a reboot, no order is repeated.
+                # A newer order may have been given while `check_effect` waited for its answer. After a reboot, no order
+                # is repeated.
+                if not order.is_newest or self.session.watch.reboots != reboots:
                     reason = SUPERSEDED if not order.is_newest else REBOOTED
                     error.args = (f"{error}; not sent again: {reason}",)
                     raise

@@ -26,8 +26,8 @@ TRIGGER, TRIGGER_INTERVAL = MavCmd.DO_TRIGGER_CONTROL, MavCmd.DO_SET_CAM_TRIGG_I
 UNCHANGED = -1  # leaves the shutter time, or the sequence number of the trigger, as it is
 # Seconds without a capture after which the status of a series is requested, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
-# Maximum number of status requests before an order. FIRST_STATUS_ATTEMPTS is for a camera that has not sent its status
-# yet.
+# Maximum number of status requests before an order. FIRST_STATUS_ATTEMPTS is for a camera that has never sent its
+# status.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
 # A series has failed if this many successive status checks have shown no new capture.
 MAX_SILENT_CHECKS = 6
@@ -47,7 +47,7 @@ class Shutter:
         self._sequence_number = 0  # sequence number of the photo that was ordered last
         self._lock = anyio.Lock()
         self._reports_status = False  # True once the camera has sent CAMERA_CAPTURE_STATUS
-        self._ignored_requests = False  # True once the camera has answered no request for its status before an order
+        self._ignored_requests = False  # True if the requests before an order have never been answered
 
     async def request_status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
         """Request CAMERA_CAPTURE_STATUS; None if the camera does not send it."""
@@ -91,7 +91,7 @@ class Shutter:
                 attempts = 1
                 unacknowledged = await self.order_photo(status_before)
                 while True:
-                    # The next picture may be another camera's.
+                    # The reopened link may lead to another vehicle, whose camera takes the next picture.
                     watch.raise_if_other_boot(other_boots, f"{self.link.describe()} may have taken the picture")
                     while capture := new_captures.pop():
                         if _is_new(capture, status_before, old_indices):
@@ -234,7 +234,7 @@ class PhotoInterval:
         # The highest plausible index so far, and when it was received.
         self._newest_index = 0
         self._newest_at = 0.0
-        self._unanswered_requests = 0  # in succession
+        self._unanswered_requests = 0  # number of consecutive requests without an answer
         # Received captures that were not delivered yet: the successful ones by index, and the failed ones.
         self._received: dict[int, Capture] = {}
         self._failed: list[Capture] = []
@@ -345,7 +345,7 @@ class PhotoInterval:
         self._received = {first.index: first}
 
     def _guess_start(self, index: int) -> None:
-        self._is_start_guessed = self._next_index is None  # A second call corrects the guess.
+        self._is_start_guessed = self._next_index is None  # True in the first call; a second call corrects the guess.
         self._next_index = index
         self._received.clear()  # It may contain a capture with a corrupt index.
         self._newest_index = index - 1  # One less, so that `_add` accepts the capture as the newest one.

@@ -39,8 +39,8 @@ def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
 
     ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed.
     """
-    # An accepted command takes effect within this delay. If the vehicle reports disarmed later, the command had no
-    # effect, and another party has armed the vehicle afterwards.
+    # An accepted command takes effect within ARM_HEARTBEAT_DELAY_S. If the vehicle reports disarmed later, the command
+    # had no effect, and another party has armed the vehicle afterwards.
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
@@ -59,7 +59,8 @@ class CommandArbiter:
         is_held_back: Callable[[], bool] = lambda: False,
     ) -> None:
         self._now, self._telemetry = now, telemetry
-        # Returns True from a loss of the link until the vehicle's clock shows whether it is the same boot.
+        # Returns True from a loss of the link until the vehicle's clock shows whether the reopened link leads to the
+        # same boot of the same vehicle.
         self._is_held_back = is_held_back
         # Returns how many seconds the computer has slept since the given time.
         self.slept_since = slept_since
@@ -84,12 +85,12 @@ class CommandArbiter:
         # An order without commands, updated with each HEARTBEAT. It records whether a takeover or a failsafe has
         # occurred since the program armed the vehicle. None if another party has armed it.
         self._arming_order: Order | None = None
-        # The last order about flight or mode, and the orders of `auxiliary_order` blocks in progress.
+        # The last steering order, and the orders of `auxiliary_order` blocks in progress.
         self._orders_in_progress: list[Order] = []
         self._posted_orders: list[Order] = []  # orders whose `posted_order` block is active
         self._sent_commands: list[SentCommand] = []  # commands whose `sending` block is active
-        # Modes that HEARTBEAT may still report although the order for them has ended, and the mode after a mission.
-        # Each has the time at which it was added.
+        # Modes that HEARTBEAT may still report although the order for them has ended, and the mode to which the vehicle
+        # changes by itself after a mission. Each has the time at which it was added.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._order_numbers = itertools.count(1)
         self._open_mode_changes = 0  # how many `changing_mode` blocks are open
@@ -238,7 +239,7 @@ class CommandArbiter:
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
-        # The vehicle may still change to the modes of the last order about flight or mode.
+        # The vehicle may still change to the modes of the last steering order.
         modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ending_topics
         action_topics = (ACTION,) if ends_with_actions else ()
@@ -388,15 +389,15 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
-        # After a takeover, the vehicle executes no order, except one that was posted later (`is_newest` is then False).
-        # A mode change after an order without modes may be the effect of this order.
+        # After a takeover, the vehicle executes no order of the program, except one that was posted after `order`
+        # (`is_newest` is then False). If `order` has no modes, a mode change may be its effect and not a takeover.
         was_taken_over = order is not None and bool(order.takeover_reason) and bool(order.modes) and order.is_newest
         # After a takeover, a vehicle that the program has armed stays armed.
         return "arm" in topics if was_taken_over else bool(topics)
 
     @property
     def is_state_recent(self) -> bool:
-        self.slept_since(self._now())  # If the computer has just slept, this call adds the sleep to all ages.
+        self.slept_since(self._now())  # If the computer has just slept, this call adds the time asleep to all ages.
         return self._telemetry.armed.age <= MODE_MAX_AGE_S and not self._is_held_back()
 
     @property

@@ -203,7 +203,7 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
-            # False if another task has given an order meanwhile, above all to disarm. This call sent one arm command.
+            # False if another task has given an order meanwhile, above all to disarm. This call has sent one command.
             is_newest_order = (
                 self._arbiter.latest(STEERING) is order_before
                 and self._arbiter.arm_commands_sent == arm_commands_before + 1
@@ -230,7 +230,7 @@ class ArmingActions(VehicleBase):
                 await self._await_armed(
                     armed=True, order=order, started=started, timeout=timeout, max_silence_s=max_silence_s
                 )
-                if self._is_in_unordered_flight_mode():  # One HEARTBEAT may report the new mode and the arming.
+                if self._is_in_unordered_flight_mode():  # The HEARTBEAT that reports armed may report another mode.
                     raise OperationRejected(f"arm(): the mode changed to {self.telemetry.mode_name}")
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise

@@ -103,8 +103,8 @@ HOLD_CLOSE_TIMEOUT_S = 1.5
 # Maximum number of attempts to hold after an abandoned order. After a time-out, the next attempt waits for a HEARTBEAT.
 MAX_HOLD_ATTEMPTS = 3
 
-# A hold is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most MAX_HOLD_RESENDS times; on a
-# slow link later and less often.
+# A hold is repeated if it is not acknowledged within HOLD_ACK_TIMEOUT_S seconds, at most MAX_HOLD_RESENDS times. On a
+# slow link, it is repeated later and less often.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
 # NaN means the present position, so the vehicle brakes and does not fly back to a point that it has passed.
@@ -122,7 +122,7 @@ class FlightCleanup:
         self.stop_stream: Callable[[str], None] | None = None
         self._awaited_order: Order | None = None
         self._task = BackgroundTask(session, "aerokit hold", warning_clause="before a hold was confirmed")
-        # A new order about flight or mode makes the confirmation of an earlier hold pointless.
+        # After a new steering order, an earlier hold need not be confirmed any more.
         arbiter.on_steering(self._task.cancel)
 
     async def hold(self) -> None:
@@ -185,7 +185,7 @@ class FlightCleanup:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:
             return False
-        # An order that `only_stops` was probably sent by `stop_in` already, so it is repeated only after a HEARTBEAT.
+        # If `only_stops` is True, `stop_in` has probably sent the hold already. It is then repeated after a HEARTBEAT.
         can_send_now = self._arbiter.is_state_recent and not order.only_stops
         if can_send_now:
             command, *params = self._hold_command(mode)
@@ -205,7 +205,7 @@ class FlightCleanup:
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:
-                    # Every new order about flight or mode cancels this task, except the one that the task gives itself.
+                    # Every new steering order cancels this task, except the one that the task gives itself.
                     with self._task.protected():
                         order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)
@@ -246,7 +246,7 @@ class FlightCleanup:
         try:
             with self.flying(order):
                 yield
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # also CommandTimeout and HeartbeatTimeout
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # CommandTimeout and HeartbeatTimeout are included.
             self.hold_in_background(order)
             raise
 

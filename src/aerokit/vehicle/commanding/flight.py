@@ -165,7 +165,7 @@ class FlightActions(VehicleBase):
     async def _await_altitude(
         self, altitude_m: float, plan: TakeOff, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
-        # A vehicle that hovers at the altitude may be slightly below it, but not on the ground.
+        # A hovering vehicle may be slightly too low. A vehicle on the ground must not be within the tolerance.
         tolerance_m = min(max(0.5, 0.05 * altitude_m), 0.5 * altitude_m)
         started = self.connection.now()
         # If home moves during the climb, the vehicle keeps its target altitude: PX4 corrects the altitude of home in
@@ -393,7 +393,7 @@ class ModeActions(VehicleBase):
             return ""
         if not order.has_lost_mode:  # The mode has not changed, so only a failsafe can be a takeover.
             return order.failsafe
-        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # or unknown
+        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # True if unknown
         awaits_heartbeat = self.telemetry.armed.updated_at < order.mode_lost_at
         if may_have_landed and awaits_heartbeat:
             # PX4 leaves LAND when it disarms. CURRENT_MODE may report the new mode before HEARTBEAT reports that the

@@ -121,7 +121,7 @@ class ImpactDetector:
         # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
         if drop_m is None or drop_m >= MIN_DROP_M:
             self._impact_sink_m_s = self._max_sink_m_s
-            # Even an old altitude is needed, so that a later altitude can show that the vehicle flies on.
+            # Store even an old altitude, because only the difference from a later one shows that the vehicle flies on.
             self._impact_altitude_m = altitude_amsl(self._telemetry)
 
     def describe(self) -> str:

@@ -153,7 +153,7 @@ class ManeuverActions(VehicleBase):
             check_range("rounds", rounds, 0, MAX_ROUNDS, above=True)
             if rounds * 2 != int(rounds * 2):
                 raise InvalidArgument(f"rounds = {rounds!r} is not allowed: it must be a multiple of 0.5")
-        can_use_command = self._is_on_wings and self.autopilot.circles_by == "orbit"  # a PX4 fixed wing
+        can_use_command = self._is_on_wings and self.autopilot.circles_by == "orbit"  # True for fixed wings on PX4
         can_use_setpoints = not self._is_on_wings and self.autopilot.setpoints.trajectory
         if not (can_use_command or can_use_setpoints):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")

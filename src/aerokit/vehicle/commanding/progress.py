@@ -222,7 +222,7 @@ class CircleDetector:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._min_m = self._max_m = 0.0  # smallest and largest distance since the turn began; 0: no turn has begun
+        self._min_m = self._max_m = 0.0  # smallest and largest distance since the turn began; 0 before any turn
         self._bearing_deg = 0.0
         self._turned_deg = 0.0  # angle by which the bearing from the place has changed, positive clockwise
         self._circle_radius_m = -math.inf  # −inf until the first half circle is complete

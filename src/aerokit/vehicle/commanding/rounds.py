@@ -170,7 +170,7 @@ class RoundFlight:
     def _flown_radius_problem(self, radius_m: float) -> str:
         """Return a text if a plane circles the center, but not near the ordered circle; otherwise an empty one."""
         here = self._telemetry.position.latest
-        is_endless = math.isinf(self._rounds)  # The call waits for no round, so any circle will do.
+        is_endless = math.isinf(self._rounds)  # The call does not wait for rounds, so any circle will do.
         if self._counter is None or is_endless or radius_m <= 0 or here is None:
             return ""
         if self._counter.is_on_path:

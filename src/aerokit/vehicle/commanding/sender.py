@@ -154,8 +154,8 @@ class OrderSender:
             self.raise_if_slept(order)
         if self._arbiter.is_state_recent:
             return
-        # After `MAX_SILENCE_S`, the command would be too late. HEARTBEATs that wait to be read after a blocked event
-        # loop do not extend this time.
+        # After a silence of `MAX_SILENCE_S`, the command would be too late. HEARTBEATs that could not be read earlier,
+        # because the event loop was blocked, do not extend this time.
         with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)) as scope:
             await self._session.wait_for_heartbeat()
         if scope.cancelled_caught:

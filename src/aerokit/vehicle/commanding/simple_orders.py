@@ -262,7 +262,7 @@ async def receive_once(
             refusal = await request_refusal(
                 session.commands, message_type.ID, component_id=target, attempts=1, attempt_timeout=0.5
             )
-            is_refused = refusal is not None and not may_get_late_ack  # Else it may answer an earlier request.
+            is_refused = refusal is not None and not may_get_late_ack  # A late ack may belong to an earlier request.
             # After a refusal, only a message that has already arrived is returned.
             with anyio.move_on_after(0 if is_refused else 0.5):
                 async for message in messages:  # Other components may send the same message.

@@ -27,7 +27,7 @@ __all__ = ["StickInput", "StickStream"]
 NO_VALUE = 0x7FFF
 # Values of RC_CHANNELS_OVERRIDE that release channels 1 to 8, release channels 9 to 18, or leave a channel unchanged.
 RELEASED, RELEASED_UPPER, UNCHANGED = 0, 0xFFFE, 0xFFFF
-# Channels that MANUAL_CONTROL overrides on ArduSub, from 1 (joystick.cpp).
+# On ArduSub, MANUAL_CONTROL overrides the channels from 1 to this one (joystick.cpp).
 SUB_CHANNELS = 11
 MAX_BUTTONS = 0xFFFF
 

@@ -321,7 +321,7 @@ class SteeringStream(ValueStream[ValueT]):
 
     def _takeover_reason(self) -> str | None:
         if self._order is not None and not self._order.is_newest:
-            return SUPERSEDED  # Checked first, because the newer order may have changed the mode.
+            return SUPERSEDED  # This is checked before the mode, because the newer order may have changed the mode.
         mode = self._session.telemetry.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"

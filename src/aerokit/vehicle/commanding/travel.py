@@ -63,9 +63,9 @@ RESEND_INTERVAL_S = 1.0
 # The vehicle has arrived once it has been within the arrival radius for this many seconds.
 ARRIVED_FOR_S = 0.5
 
-# A direction is sent only with turns between these angles, whose shorter way might be the wrong one. With other turns,
-# it might cause almost a full circle, because ArduPilot measures the turn from its own target heading, not from the
-# reported heading (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
+# A direction is sent only with turns between these angles, because the shorter way might then be the wrong one. With
+# other turns, a direction might cause almost a full circle, because ArduPilot measures the turn from its own target
+# heading, not from the reported heading (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad).
 MIN_DIRECTED_TURN_DEG, MAX_DIRECTED_TURN_DEG = 170, 350
 
 # The command for a turn with a direction is sent only once, with this many seconds for its acknowledgement.
@@ -135,7 +135,7 @@ class TravelActions(VehicleBase):
         try:
             with self._flight_cleanup.holding_if_abandoned(order):
                 unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
-                if unacknowledged_target is None:  # The vehicle keeps the altitude AMSL when home moves.
+                if unacknowledged_target is None:  # After DO_REPOSITION, the altitude AMSL stays if home moves.
                     target = self._position.with_amsl_altitude(target)
                 is_incomplete = True
                 if speed_m_s is not None and not self._speeds_by_reposition:

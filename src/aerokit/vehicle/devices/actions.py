@@ -30,7 +30,7 @@ FailureKind = Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed
 Severity = Literal["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"]
 # fmt: on
 FailureIntent = Literal["inject failure"]
-# The name without its first word: SENSOR_GYRO becomes "gyro".
+# The keys are the names without their first word: "gyro" for SENSOR_GYRO.
 UNITS: dict[str, FailureUnit] = {unit.name.partition("_")[2].lower(): unit for unit in FailureUnit}
 INJECT_FAILURE = SimpleOrder(
     "inject_failure",

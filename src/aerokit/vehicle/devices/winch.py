@@ -118,8 +118,8 @@ class Winch(ReadOnly):
 
         def has_paid_out(status: m.WinchStatus) -> bool:
             nonlocal max_moved_m
-            # A turning winch moved its line further between `status_before` and the command. `max_moved_m` is the limit
-            # of this movement: the command was acknowledged before this function was called for the first time.
+            # A turning winch moved its line further between `status_before` and the command. `max_moved_m` limits this
+            # movement. It is computed in the first call, because the command was acknowledged before that call.
             if max_moved_m is None:
                 max_moved_m = status_before.speed * (now() - reported_at) if was_turning else 0.0
             moved_m = status.line_length - length_m - status_before.line_length

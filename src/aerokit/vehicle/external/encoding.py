@@ -218,7 +218,7 @@ class MeasurementEncoder:
 
     def obstacle_points(self, value: v.ObstaclePoints) -> tuple[Message, ...]:
         check_range("min_m", value.min_m, 0, 1e5)
-        check_range("max_m", value.max_m, 0, 1e5, above=True)  # above 0
+        check_range("max_m", value.max_m, 0, 1e5, above=True)
         time_ms = (self._time_us(value.measured_at) // 1000) & 0xFFFFFFFF  # The field has 32 bits.
         limits_m = (value.min_m, value.max_m)
         for point in value.points_m:

@@ -43,7 +43,7 @@ class TimesyncAnswers:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._open_streams = 0  # number of streams that need the answers
+        self._open_streams = 0  # number of open streams, which all need the answers
         self._detach: Detach | None = None
 
     def open(self) -> None:

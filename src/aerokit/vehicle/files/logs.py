@@ -418,7 +418,7 @@ async def log_path(
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             # When its logs are requested, PX4 writes a list file with one path for each log id.
             logs = await _read_list_file(files, directory, idle_timeout_s)
-            # PX4 measured both sizes when it wrote the list, so a different size means a different log.
+            # PX4 also takes `log.size` from this list, so a different size means a different log.
             has_same_size = log.id < len(logs) and logs[log.id].size == log.size
             return logs[log.id].path if has_same_size else None
     return None

@@ -255,7 +255,8 @@ class GimbalControl:
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
-        # Registered before the request: control must also be released if `async with connect(…)` ends meanwhile.
+        # The callback is registered before the request, so that control is also released if `async with connect(…)`
+        # ends meanwhile.
         self._detach_callbacks.append(orders.context.on_finish(self._finish))
         since = self._session.connection.now()
         try:

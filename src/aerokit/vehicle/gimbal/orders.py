@@ -273,7 +273,7 @@ class GimbalOrders:
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        # Not -2, which stands for the sender of the command: PX4 then gives control to itself (input_mavlink.cpp).
+        # -2 would stand for the sender of the command, but PX4 then gives control to itself (input_mavlink.cpp).
         controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         primary, secondary = (controller, unchanged) if is_primary else (unchanged, controller)

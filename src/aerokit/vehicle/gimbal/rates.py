@@ -100,7 +100,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         orders = self._orders
         self._order = orders.begin_order()
         self._cleanup.enter_context(orders.device.in_use())
-        # Registered before the command: the gimbal must also stop if `async with connect(…)` ends before the ack.
+        # The callback is registered before the command, so that the gimbal also stops if `async with connect(…)` ends
+        # before the ack.
         self._cleanup.callback(orders.context.on_finish(self._finish))
         try:
             is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, rates=self._value, flags=self._flags)
@@ -121,7 +122,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)  # This sets `_stop_error`.
         if self._stop_error is None:
-            # Created before `_end`: afterwards it might address another gimbal.
+            # Create the command before `_end`, because afterwards it might address another gimbal.
             stop_command = self._zero_rates_command()
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")

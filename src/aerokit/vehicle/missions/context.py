@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
     from aerokit.vehicle.session.transfers import Transfers
 
-# Maps commands that land the vehicle at the end of a mission to the mode in which it may do so.
+# Maps commands that may land the vehicle at the end of a mission to the purpose of the mode in which it lands.
 LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: "return",
     MavCmd.NAV_LAND: "land",
@@ -54,11 +54,11 @@ FINAL_ITEM_MAX_AGE_S = 3.0
 
 # For this many seconds after a second start of its mission, a vehicle may still report that the mission is complete.
 STALE_STATE_S = 3.0
-# Every MISSION_CURRENT is compared with these members. Python 3.11 takes 0.3 µs to look up one.
+# Every MISSION_CURRENT is compared with these members. They are looked up once, because Python 3.11 takes 0.3 µs each.
 _ACTIVE, _COMPLETE = MissionState.ACTIVE, MissionState.COMPLETE
 
 
-# The message repeats the same values, and comparing one object with itself is faster than comparing two equal ones.
+# MISSION_CURRENT repeats its values. For equal values, the cache returns the same object, which is compared faster.
 _mission_progress = lru_cache(maxsize=4)(MissionProgress)
 
 
@@ -90,7 +90,7 @@ class PlanCache:
 class PlanVersion(NamedTuple):
     """Value that changes whenever this program notices a change of the vehicle's plan."""
 
-    changes: int  # also counts the plans of other stations on a shared link
+    changes: int  # number of known changes, including those by other stations on a shared link
     plan_id: int  # the vehicle's id; 0 except on PX4
 
 
@@ -117,7 +117,7 @@ class PlanContext:
             session.connection.bus.attach(MissionAck, self._on_ack, system_id=session.system_id),
             session.connection.bus.attach_event(MissionFinished, self._on_finished),
         )
-        # After a reboot, or if the reopened link leads to another vehicle, the plans may be others.
+        # After a reboot, or if the reopened link leads to another vehicle, the vehicle may have other plans.
         session.on_reboot += [partial(self._forget_plan, cache) for cache in self.caches]
         self.tracker: MissionTracker = MissionTracker(session, self._may_end_by_landing)
         self.caches[MavMissionType.MISSION].on_forget = self.tracker.on_plan_replaced

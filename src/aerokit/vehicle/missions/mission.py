@@ -417,7 +417,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 stall_reason=MissionStallDetector(session, self._tracker, mode, items, self._is_held_by_pause),
-                at_positions=False,  # Checks at each position would cost much in a mission of hours.
+                at_positions=False,  # In a mission of hours, checks at each position would take much CPU time.
             )
 
     def _is_held_by_pause(self) -> bool:
@@ -552,7 +552,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                # Only PX4 refuses commands after it has accepted them, and PX4 does not get MISSION_START.
+                # `refusals` is empty, because only PX4 refuses accepted commands, and PX4 does not get MISSION_START.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )

@@ -325,7 +325,7 @@ class PlanTransfer(Generic[PlanT]):
         if not (is_small_fence and self._context.autopilot.erases_small_fences):
             return False
         uploaded = self._cache.items
-        self._cache.forget(self._context.now())  # This call may fail or be cancelled.
+        self._cache.forget(self._context.now())  # The plan stays unknown if this call fails or is cancelled.
         changes = self._cache.changes
         await anyio.sleep(FENCE_ERASED_WITHIN_S)
         if (await self._channel.receive(only=())).count == 0:

@@ -39,8 +39,8 @@ ANSWER_DELAY_S, MAX_READS_AT_DEFAULT_RATE = 0.1, 5
 DEFAULT_INTERVAL = 0
 # Seconds after a write in which late or repeated answers to it may arrive.
 LATE_ANSWER_S = 3.0
-# A read that is unanswered after this many seconds probably asks for a parameter that the vehicle lacks. The request is
-# then repeated several times, so that a higher rate of answers is worth its cost.
+# A read that is unanswered after this many seconds probably asks for a parameter that the vehicle lacks. Because the
+# request is then repeated several times, a higher rate of answers is worth its cost.
 RAISE_DELAY_S = 0.5
 # Fewer changes than this are set one by one. A file would not be faster, and the vehicle confirms each value.
 MIN_CHANGES_FOR_FILE = 10

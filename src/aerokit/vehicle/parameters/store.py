@@ -40,7 +40,7 @@ class ParameterStore:
 
     def __init__(self, transfers: Transfers, read_later: Callable[[str, float], None]) -> None:
         self._transfers = transfers
-        self._read_later = read_later  # reads a parameter in the background at a time
+        self._read_later = read_later  # schedules a background read of a parameter at a given time
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table, built when it is needed; None after a change.
         self._table: ParameterTable | None = ParameterTable()

@@ -158,7 +158,7 @@ class _Block:
         # If another block waits long for an answer, restore the values of this block without waiting for it.
         async with self._registry.exclusive(self._idle_timeout_s):
             to_restore = self._take_saved()
-            # Registered before the write, so that a block that reads a temporary value saves this value instead.
+            # Register these values before the write. A block that reads a temporary value then saves the restored one.
             self._registry.restored.update({param.name: param for param in to_restore})
             # A blocked event loop may have lengthened the wait. This must not use up the time to restore the values.
             waited_s = min(anyio.current_time() - began_at, self._idle_timeout_s)

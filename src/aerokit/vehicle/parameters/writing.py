@@ -84,7 +84,7 @@ class NameResolver:
         # If the vehicle reboots meanwhile, the store is cleared, and parameters that were known must also be read.
         while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:
             read = await self._access.read(to_read, idle_timeout_s, probe=True)
-            # An error is wrong if the value has arrived right after it, as late answers do in a burst.
+            # Late answers arrive in a burst. If the value has arrived right after an error, the error is obsolete.
             answers |= {name: read[name] for name in read if isinstance(read[name], Parameter) or name not in store}
         for requested, name in normalized.items():
             result = self._resolve_one(name, answers)
@@ -309,7 +309,7 @@ class ParameterWriter:
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
         """Send the planned values. The answers are keyed by the names on the vehicle."""
-        if upload is None:  # `write` sends each name once, even if two plans have it, and skips no unchanged value.
+        if upload is None:  # `write` sends each name once, even if two plans have it. It also sends unchanged values.
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
         # Two names may mean the same parameter, which must be in the file only once.
         changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}

@@ -33,7 +33,7 @@ PENDING_ACK_TIMEOUT_S = 2.0
 # repeat after 256 frames, so that a new ack is equal by chance only if the vehicle sends more than 256 frames a second.
 COPY_WINDOW_S = 1.0
 MAX_RECENT_ACKS = 16
-# A HEARTBEAT of the last seconds has another sequence number than an ack, unless the sender's number is constant.
+# If a HEARTBEAT of the last seconds has the sequence number of an ack, the sender does not count its frames.
 HEARTBEAT_WINDOW_S = 2.0
 
 _Key = tuple[int, int]

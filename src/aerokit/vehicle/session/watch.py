@@ -45,13 +45,13 @@ EXPECTED_REBOOT_MIN_LAG_MS = 2000
 # RESUME_CONFIRM_S. The first messages may be late.
 RESUME_TOLERANCE_S, RESUME_TOLERANCE_RATIO = 1.5, 0.05
 RESUME_CONFIRM_S = 1.0
-# If the vehicle sends no time since boot for this many seconds after its first message, it counts as rebooted. It
-# also does so if delayed messages seem to arrive for MAX_HOLD_BACK_S.
+# On a reopened link, the vehicle counts as rebooted if it sends no time since boot for RESUME_TIMEOUT_S. It also counts
+# as rebooted if its clock proves nothing for MAX_HOLD_BACK_S, because its messages seem delayed.
 RESUME_TIMEOUT_S, MAX_HOLD_BACK_S = 5.0, 30.0
 # A simulation's clock may be faster than real time. Its speed is computed from two reports that are more than this
 # many seconds apart.
 CLOCK_SPAN_S = 5.0
-# A greater time, in TIMESYNC answers of other firmware, is the time of day, which is the same on all vehicles.
+# A greater time is not a time since boot: some firmware answers TIMESYNC with the time of day, equal on all vehicles.
 MAX_RUNNING_TIME_MS = 100_000_000_000
 # If the clock was observed for less than this before the loss of the link, its speed is not known.
 MIN_CLOCK_SPAN_S = 1.0
@@ -74,7 +74,7 @@ class _ClockReading:
     ``waited_s`` is how long the report may have waited before, because the event loop was blocked.
     """
 
-    # Created for many messages, and five times as fast as a NamedTuple.
+    # Many messages create an instance, and this class is five times as fast as a NamedTuple.
     __slots__ = ("milliseconds", "read_at", "waited_s")
 
     def __init__(self, milliseconds: int, read_at: float, waited_s: float = 0.0) -> None:
@@ -136,12 +136,12 @@ class VehicleWatch:
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
         # The lowest reading of each decreased clock, until `_is_decrease_confirmed` decides if it shows a reboot.
         self._decreased_readings: dict[str, _ClockReading] = {}
-        # Makes the connection deliver the vehicle's frames again. It holds them back from a loss of the link until the
-        # vehicle's clock shows whether it is the same boot of the same vehicle. None if they are not held back.
+        # Makes the connection deliver the vehicle's frames again. After a loss of the link, the connection holds them
+        # back until the vehicle's clock shows whether it is the same boot of the same vehicle. None at other times.
         self._deliver_again: Detach | None = None
-        # The clocks when the link was lost, as far as their speed was known.
+        # The clocks when the link was lost, as far as later readings can be compared with them.
         self._lost_clocks: dict[str, _LostClock] = {}
-        # The first reading of each clock since the loss that does not continue the clock.
+        # For each clock, the first reading since the loss that does not continue the clock.
         self._resumed_readings: dict[str, _ClockReading] = {}
         # Time of the first frame since the loss, and of the last reading since that frame.
         self._first_held_back_at: float | None = None
@@ -365,7 +365,7 @@ class VehicleWatch:
         resumed = self._resumed_readings.get(clock, reading)
         resumed_s = reading.read_at - resumed.read_at
         if reading.milliseconds - resumed.milliseconds > speed * (resumed_s + RESUME_CONFIRM_S / 2):
-            resumed = reading  # The clock runs too fast, so delayed messages arrive in a burst.
+            resumed = reading  # The clock seems to run too fast, because delayed messages arrive in a burst.
         self._resumed_readings[clock] = resumed
         return reading.read_at - resumed.read_at >= RESUME_CONFIRM_S
 

@@ -266,7 +266,7 @@ def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
     return _mission_progress(message.seq, message.total, message.mission_state)
 
 
-@lru_cache(maxsize=16)  # The message is repeated, and always decoded when it arrives.
+@lru_cache(maxsize=16)  # MISSION_CURRENT repeats its values, and every MISSION_CURRENT is decoded.
 def _mission_progress(seq: int, total: int, mission_state: int) -> MissionProgress:
     state = enum_member(MissionState, mission_state)
     if total == U16:  # There is no mission. A total of 0 means that the vehicle does not report the total.

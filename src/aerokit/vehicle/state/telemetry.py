@@ -196,7 +196,7 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        # Restored below, because calls may be nested: a handler may read a cell, which then decodes another message.
+        # This is restored below, because a handler may read a cell, which decodes another message in a nested call.
         outer_arrived_at = self._arrived_at
         # The cells get the time at which the frame arrived as their timestamp.
         self._arrived_at = None if frame is None else frame.received_at
