@@ -25,7 +25,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavSeverity
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavSeverity, MavState
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.calibration.calibration import Calibration
@@ -449,6 +449,27 @@ async def test_lost_result_of_px4_is_reported_as_unknown() -> None:
             async for step in vehicle.calibrate.gyroscope():
                 if step.progress:
                     px4.send_text = lambda *_: None
+
+
+async def test_late_result_of_px4_is_received_after_a_long_step() -> None:
+    """The vehicle ends the calibration while the program handles a step."""
+    texts: list[tuple[Any, ...]] = []
+    calibrating = 0  # number of steps in the state CALIBRATING
+    async with stage(SimulatedPx4) as (px4, vehicle, _):
+        send_text = px4.send_text
+
+        def send_all() -> None:
+            for arguments in texts:
+                send_text(*arguments)
+
+        async for step in vehicle.calibrate.gyroscope():
+            calibrating += vehicle.system_status.latest == MavState.CALIBRATING
+            if calibrating == 2 and not texts:
+                px4.send_text = lambda *arguments: texts.append(arguments)
+                await vehicle.system_status.wait_until(lambda status: status != MavState.CALIBRATING)
+                await anyio.sleep(2.0)
+                asyncio.get_running_loop().call_later(0.5, send_all)
+    assert step.result is not None
 
 
 async def test_silent_vehicle_raises_heartbeat_timeout() -> None:

@@ -53,23 +53,25 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    # When the vehicle was last seen in the state CALIBRATING. Infinite before the first time, so that
-    # `has_ended_silently` returns False.
-    last_calibrating_at = math.inf
+    ended_at = math.inf  # when the vehicle left the state CALIBRATING
     with ExitStack() as cleanup:
 
         def on_text(text: str) -> None:
             if report := parse_report(text):  # Texts that are not about a calibration are ignored.
                 reports.append(report)
 
+        def on_status(previous: int | None, status: int) -> None:
+            nonlocal ended_at
+            if MavState.CALIBRATING in (previous, status):
+                ended_at = math.inf if status == MavState.CALIBRATING else now()
+
+        def has_ended_silently() -> bool:
+            return now() - ended_at > END_GRACE_S
+
         # Without `every_arrival`, a text that equals the previous one would not be reported.
         cleanup.callback(telemetry.status_text.observe(lambda _, text: on_text(text.text), every_arrival=True))
-
-        def has_ended_silently() -> bool:  # `run.wait` calls this repeatedly, which updates the time.
-            nonlocal last_calibrating_at
-            if telemetry.system_status.latest == MavState.CALIBRATING:
-                last_calibrating_at = now()
-            return now() - last_calibrating_at > END_GRACE_S
+        # Observed rather than read by `has_ended_silently`, which is not called while the program handles a step.
+        cleanup.callback(telemetry.system_status.observe(on_status))
 
         await run.start(*params)
         step = run.new_step(0.0, "keep the vehicle still")
