@@ -6,8 +6,8 @@ Behaviour of servers (ArduPilot 4.7, PX4 1.17) that determines this design:
   meanwhile; it queues five requests and drops further ones. PX4 answers reads during a burst, and a new burst request
   replaces the current burst. Missing blocks are therefore requested as soon as they are noticed: four at a time during
   a burst, more afterwards.
-- Requests are always for whole blocks at multiples of the block size: ``@PARAM/param.pck`` is packed for one block
-  size.
+- Requests are always for whole blocks at multiples of the block size, because the vehicle pads ``@PARAM/param.pck`` so
+  that no value crosses the end of a block.
 - The size that ArduPilot reports for files whose names begin with ``@`` is an estimate. Only the EOF error is reliable.
 - A burst ends with a NAK that has the EOF error. If the last block was full, ArduPilot's NAK has the offset of this
   block.

@@ -2,8 +2,8 @@
 
 Behaviour of vehicles (ArduPilot 4.7, PX4 1.17) that determines this design:
 
-- ArduPilot sends the blocks of one range and ignores further requests meanwhile. A single block is sent immediately, so
-  that many can be requested. PX4 drops the previous request; over UDP it sends 256 kB in one burst, regardless of
+- ArduPilot ignores further requests while it sends the blocks of a range. It sends a single block immediately, and can
+  then answer the next request. PX4 drops the previous request; over UDP it sends 256 kB in one burst, regardless of
   losses. Therefore only one long range is requested at a time. Once it has ended, its gaps are requested: long gaps as
   ranges, single blocks many at a time with a short delay between them. Ranges become shorter if most of their blocks
   are lost.

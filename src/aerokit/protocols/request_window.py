@@ -31,7 +31,7 @@ LOSS_THRESHOLD = 3
 
 
 class PendingRequest:
-    """Times and numbers of a request's transmissions. All requests share one count of transmissions."""
+    """Times and numbers of a request's transmissions. The transmissions of all requests are numbered together."""
 
     __slots__ = (
         "attempts", "due_at", "first_at", "first_number", "last_number", "previous_sent_at", "sent_at",
