@@ -67,8 +67,8 @@ async def component(
         parameters_file: JSON file that stores the parameters; the file is replaced atomically after each change. With
             None, parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
-            ``autopilot`` of HEARTBEAT expect bytewise encoding.
+            ArduPilot does. The component's capabilities announce the encoding. Some clients ignore them and expect the
+            bytewise encoding of all systems that HEARTBEAT does not report as ArduPilot.
         accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.
