@@ -27,8 +27,8 @@ class Gimbal(GimbalPrivates):
     """The first gimbal of a vehicle: its attitude, and orders to turn it.
 
     :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle reports a gimbal. Orders return immediately.
-    A newer order replaces an unanswered order. A rejection is logged as a warning of the logger ``dronekit``. Raises
-    ValueError for invalid numbers and locations, and APIException while the link is down.
+    A newer order replaces an unanswered order. A rejection is logged as a warning of the logger ``dronekit``. Orders
+    raise ValueError for invalid numbers and locations, and APIException while the link is down.
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:

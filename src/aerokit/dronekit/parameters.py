@@ -308,8 +308,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         Args:
             name: in any case.
             value: any number.
-            retries: how often the value is requested again, once a second, if the vehicle does not answer. With 0, the
-                method returns False at once, and a failure is logged as a warning later.
+            retries: how often the value is requested again if the vehicle does not answer: once a second, or less
+                often on a slow link. With 0, the method returns False at once, and a failure is logged later.
             wait_ready: wait for the download of all parameters first, which is not necessary.
 
         Returns:

@@ -367,15 +367,16 @@ def connect(
     """Connect to a vehicle and return it after its first heartbeat.
 
     Args:
-        ip: connection string: ``'127.0.0.1:14550'`` and ``'udp:…'`` listen, ``'tcp:127.0.0.1:5760'``,
-            ``'/dev/ttyACM0'``, ``'com14'`` … (docs/addresses.md).
+        ip: connection string, such as ``'127.0.0.1:14550'`` or ``'udp:…'``, which both listen,
+            ``'tcp:127.0.0.1:5760'``, ``'/dev/ttyACM0'`` or ``'com14'`` (docs/addresses.md).
+        _initialize: False to return before the first heartbeat; then call :meth:`Vehicle.initialize`.
         wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a name or a list of
             names waits for these attributes. With None or False, ``connect`` does not wait.
         timeout: seconds for ``wait_ready``.
         still_waiting_callback: called with the set of missing names.
         still_waiting_interval: seconds between these calls.
-        status_printer: called with every STATUSTEXT of the autopilot, on the listener thread, until the vehicle is
-            closed.
+        status_printer: called on the listener thread, until the vehicle is closed, with every STATUSTEXT of the
+            autopilot that the level of the logger ``autopilot`` allows (by default, severity WARNING and above).
         vehicle_class: a subclass of :class:`Vehicle`.
         rate: Hz of the requested data streams; None requests none.
         baud: bits per second, for a serial port whose string has no baud rate.
