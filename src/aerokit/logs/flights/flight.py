@@ -320,7 +320,8 @@ class FlightLog:
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
         """Record home, if it is valid.
 
-        Until the first arming, ArduPilot moves home with the vehicle. From two seconds after it, a known home is kept.
+        Until the first arming, ArduPilot moves home with the vehicle. From two seconds after the first arming on, a
+        known home is kept.
         """
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
         if not is_valid:  # NaN is not valid, because it fails the comparisons
