@@ -90,7 +90,7 @@ class Faults:
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)
 
     def ignore(self, command: int, *, times: int | None = None) -> None:
-        """Neither execute nor acknowledge the next ``times`` commands of this MAV_CMD. None: all."""
+        """Neither execute nor acknowledge the next ``times`` commands of this MAV_CMD (None: all)."""
         self.commands[command] = CommandFault(times, ignore=True)
 
     def lose_ack(self, command: int, *, times: int | None = 1) -> None:
