@@ -165,9 +165,9 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
-        the result INVALID and a status text. The function may be a coroutine function. An empty list is a request to
-        clear the list.
+        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises an exception. Its text is sent
+        as a status text, and the result is INVALID for InvalidArgument and ValueError, otherwise ERROR. The function
+        may be a coroutine function. An empty list is a request to clear the list.
         """
         return self._loop.call(self.aio.on_upload, function)
 
@@ -251,7 +251,7 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         emitter_type: int = 0,
         age_s: int = 0,
     ) -> None:
-        """Report an aircraft that a receiver has detected (ADSB_VEHICLE).
+        """Report an aircraft that a receiver has detected (ADSB_VEHICLE). None means that a value is unknown.
 
         Args:
             icao: ICAO address, 0 to 16777215.
@@ -493,10 +493,10 @@ class OnboardComponent(ComponentTwin):
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
 
         Args:
-            authorize: function or coroutine function, called with the vehicle's system id. The function returns the
-                number of seconds for which arming is allowed, at most 255. An exception denies arming, and its text is
-                sent as a status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
-                MAV_ARM_AUTH_DENIED_REASON as ``detail``.
+            authorize: function or coroutine function, called with the vehicle's system id. The function returns for
+                how many seconds arming is allowed (above 0, at most 255). An exception denies arming, and its text is
+                sent as a status text. To deny with a MAV_ARM_AUTH_DENIED_REASON, the function returns a
+                :class:`~aerokit.onboard.CommandResult` with the result DENIED and the reason as ``detail``.
 
         Raises:
             InvalidArgument: the component already has an arm authorizer.
@@ -556,8 +556,8 @@ def component(
         parameters_file: JSON file that stores the parameters; the file is replaced atomically after each change. With
             None, parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
-            ``autopilot`` of HEARTBEAT expect bytewise encoding.
+            ArduPilot does. The component's capabilities announce the encoding. Some clients ignore them and expect the
+            bytewise encoding of all systems that HEARTBEAT does not report as ArduPilot.
         accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.
