@@ -197,8 +197,8 @@ class FlightMethods(VehicleAttributes):
         Args:
             location: latitude and longitude in degrees, and the altitude in metres above sea level (LocationGlobal) or
                 home (LocationGlobalRelative).
-            airspeed: m/s; like setting :attr:`airspeed`.
-            groundspeed: m/s; like setting :attr:`groundspeed`.
+            airspeed: in m/s; has the same effect as setting :attr:`airspeed`.
+            groundspeed: in m/s; has the same effect as setting :attr:`groundspeed`.
 
         Raises:
             ValueError: the location has another type, or one of its numbers is missing or wrong. Nothing was sent.

@@ -318,7 +318,7 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
 
     def send_calibrate_barometer(self) -> None:
-        """Store the current air pressure as that of altitude 0."""
+        """Store the current air pressure as the pressure at altitude 0."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:

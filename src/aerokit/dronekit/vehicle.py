@@ -213,8 +213,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
         Args:
             rate: Hz of the requested data streams; None requests none.
-            heartbeat_timeout: seconds to wait for the first heartbeat (0 or less: 30 s). Later, orders and waits raise
-                APIException after this many seconds without a heartbeat (0 or less: never).
+            heartbeat_timeout: seconds to wait for the first heartbeat; 0 or less means 30 s. Later, orders and waits
+                raise APIException after this many seconds without a heartbeat; 0 or less means never.
 
         Raises:
             APIException: no vehicle was found in time; the text describes what was received instead.
@@ -380,15 +380,15 @@ def connect(
         vehicle_class: a subclass of :class:`Vehicle`.
         rate: Hz of the requested data streams; None requests none.
         baud: bits per second, for a serial port whose string has no baud rate.
-        heartbeat_timeout: seconds to wait for the first heartbeat (0: 30 s). Later, orders and waits raise APIException
-            after this many seconds without a heartbeat (0: never).
+        heartbeat_timeout: seconds to wait for the first heartbeat; 0 means 30 s. Later, orders and waits raise
+            APIException after this many seconds without a heartbeat; 0 means never.
         source_system: own system id, 1 to 255.
         source_component: own component id, 0 to 255.
         use_native: ignored.
         release_overrides: release RC channels that are still overridden when the connection ends. With False, overrides
             stay, as in DroneKit, until the vehicle ends them (ArduPilot: after RC_OVERRIDE_TIME).
-        heartbeat: content of our HEARTBEAT; None: no HEARTBEAT. It stops when the program has done nothing for 60 s
-            (see :class:`aerokit.OwnHeartbeat`): no attribute read, no order, no wait, and no return from a listener.
+        heartbeat: content of our HEARTBEAT; None sends none. Our HEARTBEAT stops when the program has done nothing for
+            60 s (see :class:`aerokit.OwnHeartbeat`): no attribute read, no order, no wait, no return from a listener.
 
     Raises:
         OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).

@@ -80,8 +80,9 @@ class CameraDriver:
         streams: addresses of video streams, such as ``rtsp://192.168.0.10:8554/main``.
         has_modes: True if the camera takes pictures only in image mode and videos only in video mode
             (:meth:`set_mode`).
-        definition: camera definition file (XML) with the settings that aerokit serves by PARAM_EXT; None: no settings.
-        gimbal_id: component id of the gimbal that carries the camera; 0: none.
+        definition: camera definition file (XML) with the settings that aerokit serves by PARAM_EXT; None for no
+            settings.
+        gimbal_id: component id of the gimbal that carries the camera; 0 if there is none.
     """
 
     def __init__(

@@ -142,7 +142,7 @@ class OnboardComponent:
         """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
-            state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
+            state: MAV_STATE, such as ACTIVE, STANDBY, CALIBRATING or CRITICAL.
             base_mode: MAV_MODE_FLAG; None leaves it unchanged.
             custom_mode: mode number of this component, 0 to 4294967295; None leaves it unchanged.
 

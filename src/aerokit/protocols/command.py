@@ -192,8 +192,9 @@ class CommandExchange(Exchange[CommandAck]):
         message: the command.
         own_system: our system id.
         own_component: our component id.
-        attempts: maximum number of transmissions; None: 4, or 1 for a command in `UNREPEATABLE_COMMANDS`.
-        attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for a command in `UNREPEATABLE_COMMANDS`.
+        attempts: maximum number of transmissions. None means 4, or 1 if a repetition would have a further effect
+            (`allowed_attempts`).
+        attempt_timeout: seconds for each attempt. None means 1 s, or 4 s if ``attempts=None`` allows one attempt.
         progress_timeout: seconds from an IN_PROGRESS until the command fails, unless another answer arrives.
         on_progress: called at each IN_PROGRESS with 1–100, or None if the vehicle does not report a percentage.
         earlier_acks: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with

@@ -359,9 +359,10 @@ class FtpUpload(FtpExchange[None]):
     """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged.
 
     With ``first_block_last``, the first block is sent when all others are acknowledged. When a virtual file, whose
-    name begins with ``@``, is closed, ArduPilot evaluates it even if the upload was interrupted. Of an incomplete
-    ``@PARAM/param.pck``, it sets all parameters that have arrived, one of them to 0 or to a part of its value
-    (AP_Filesystem_Param.cpp, param_upload_parse). It ignores a file without the magic number in the first block.
+    name begins with ``@``, is closed, ArduPilot evaluates it even if the upload was interrupted. From an incomplete
+    ``@PARAM/param.pck``, it would set all parameters that have arrived, and the one at a gap to 0 or to a part of its
+    value (AP_Filesystem_Param.cpp, param_upload_parse). Without the magic number in the first block, it ignores the
+    file.
     """
 
     def __init__(

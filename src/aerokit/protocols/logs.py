@@ -222,7 +222,7 @@ class LogDownload(Transfer[int]):
 class LogStop(Transfer[None]):
     """Repeats LOG_REQUEST_END, which is not acknowledged, until the vehicle sends no more log data.
 
-    The caller sends the first one (`message`).
+    The caller sends the first LOG_REQUEST_END (`message`).
     """
 
     expects: tuple[type[Message], ...] = (LogData, LogEntry)
@@ -258,7 +258,8 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     Args:
         first_id: the id of this autopilot's oldest log.
-        max_unanswered: number of unanswered requests after which to fail; None: fail only after ``idle_timeout_s``.
+        max_unanswered: the transfer fails after this number of unanswered requests. None means that it fails only after
+            ``idle_timeout_s``.
     """
 
     expects: tuple[type[Message], ...] = (LogEntry,)

@@ -100,8 +100,8 @@ class RequestWindow(PendingRequests[KeyT]):
     """Requests, each identified by a key, with a limit on the number in flight.
 
     The limit is ``size`` at first, and grows to ``max_size`` while answers do not become slower. A request is repeated
-    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first. ``duplicate_last``
-    sends each of the last few requests as two copies from the third attempt on.
+    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first. With
+    ``duplicate_last``, when only a few requests are left, each is sent as two copies from its third attempt on.
     """
 
     def __init__(

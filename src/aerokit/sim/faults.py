@@ -83,9 +83,9 @@ class Faults:
     def refuse(
         self, command: int, result: int = MavResult.DENIED, text: str | None = None, *, times: int | None = None
     ) -> None:
-        """Answer the next ``times`` commands of this MAV_CMD (None: all) with a MAV_RESULT, without executing them.
+        """Answer the next ``times`` commands of this MAV_CMD (None: all) with a MAV_RESULT, but do not execute them.
 
-        ``text`` is sent as a status text before the answer.
+        ``text`` is sent as a status text before each answer.
         """
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)
 

@@ -177,7 +177,7 @@ class _OpenFile(FileHandle):
 class FileTree:
     """Folders and files. Leading slashes, empty parts and ``.`` in paths are ignored.
 
-    ``free_bytes`` is the remaining space; None is unlimited.
+    ``free_bytes`` is the remaining space; None means that it is unlimited.
     """
 
     def __init__(self, *, free_bytes: int | None = None) -> None:
