@@ -360,7 +360,7 @@ class FtpUpload(FtpExchange[None]):
 
     With ``first_block_last``, the first block is sent when all others are acknowledged. When a virtual file, whose
     name begins with ``@``, is closed, ArduPilot evaluates it even if the upload was interrupted. From an incomplete
-    ``@PARAM/param.pck``, it would set all parameters that have arrived, and the one at a gap to 0 or to a part of its
+    ``@PARAM/param.pck``, it would set all parameters that have arrived, and an incomplete one to 0 or to a part of its
     value (AP_Filesystem_Param.cpp, param_upload_parse). Without the magic number in the first block, it ignores the
     file.
     """

@@ -84,8 +84,8 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
             name: 1 to 16 ASCII characters without spaces.
             default: value until another program or :meth:`set` changes it. A value in the parameters file takes
                 precedence.
-            minimum: minimum of a number; None: the minimum of the type.
-            maximum: maximum of a number; None: the maximum of the type.
+            minimum: minimum of a number; None means the minimum of the type.
+            maximum: maximum of a number; None means the maximum of the type.
             unit: unit for the metadata, such as ``"m/s"``.
             description: description for the metadata.
             values: maps each allowed number to its name; other numbers are refused.
@@ -348,7 +348,7 @@ class OnboardComponent(ComponentTwin):
         """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
-            state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
+            state: MAV_STATE, such as ACTIVE, STANDBY, CALIBRATING or CRITICAL.
             base_mode: MAV_MODE_FLAG; None leaves it unchanged.
             custom_mode: mode number of this component, 0 to 4294967295; None leaves it unchanged.
 
@@ -550,7 +550,7 @@ def component(
             component and a ground station. The arguments after ``accepts`` are then not allowed.
         system_id: system id of the component, 1 to 255. Use the system id of the vehicle that carries the component.
         component_id: component id (MAV_COMPONENT), 1 to 255.
-        type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
+        type: MAV_TYPE of the heartbeat, such as ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH or GRIPPER.
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
         identity: vendor, model and versions that the component reports.
         parameters_file: JSON file that stores the parameters; the file is replaced atomically after each change. With
@@ -558,7 +558,7 @@ def component(
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
             ArduPilot does. The component's capabilities announce the encoding. Some clients ignore them and expect the
             bytewise encoding of all systems that HEARTBEAT does not report as ArduPilot.
-        accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
+        accepts: system ids whose messages are processed; None means all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.
         mavlink_version: version of sent messages, 1 or 2.

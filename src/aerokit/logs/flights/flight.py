@@ -280,7 +280,7 @@ class FlightLog:
         return self.modes[index - 1].name if index else ""
 
     def item_label(self, item: Waypoint) -> str:
-        """Return the number to show for a mission item. ArduPilot's item 0 is "home", so its item 1 is shown as 0."""
+        """Return the label of a mission item: its number without home. ArduPilot's item 0 is "home", its item 1 "0"."""
         if self.autopilot != "ArduPilot":
             return str(item.number)
         return str(item.number - 1) if item.number else "home"
