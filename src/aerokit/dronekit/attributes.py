@@ -59,7 +59,8 @@ class Locations(HasObservers, LocationPrivates):
     def global_frame(self) -> LocationGlobal:
         """Latitude and longitude in degrees, altitude above mean sea level in metres (GLOBAL_POSITION_INT).
 
-        A new object each time. Latitude and longitude are None without a fix; the altitude is None until it is known.
+        Each access returns a new object. Latitude and longitude are None without a fix; the altitude is None until it
+        is known.
         """
         message = self._global.message
         if message is None:

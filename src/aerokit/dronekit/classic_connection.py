@@ -134,7 +134,7 @@ class ClassicConnection:
         )
 
     def match_mavlink_version(self, heartbeat: Message) -> None:
-        """Send in MAVLink 2 if the vehicle supports it, otherwise in the version of its HEARTBEAT."""
+        """Set the version of sent messages: 2 if the vehicle supports MAVLink 2, otherwise that of its HEARTBEAT."""
         frame = heartbeat.received_frame
         if frame is not None:
             version = 2 if self.supports_mavlink_2 else frame.version

@@ -73,7 +73,7 @@ class Command(_MissionItem):
         target_system: ignored; adding the command sets it.
         target_component: ignored.
         seq: ignored; adding the command sets it.
-        frame: MAV_FRAME, which is the reference of ``z``; 0: sea level, 3: home, 10: terrain.
+        frame: MAV_FRAME, which is the reference of ``z``: 0 is sea level, 3 is home, 10 is the terrain.
         command: MAV_CMD.
         current: ignored, except that 1 in the first row of a waypoint file marks home.
         autocontinue: 0 makes PX4 stay at the item; ArduPilot always continues.
@@ -165,7 +165,7 @@ class CommandSequence:
         change the sequence, and can be repeated.
 
         Args:
-            timeout: seconds in total; None: no limit, but ten seconds without progress raise TimeoutError.
+            timeout: seconds in total. None means no limit, but ten seconds without progress raise TimeoutError.
 
         Raises:
             TimeoutError: the vehicle did not answer in time.
@@ -192,7 +192,7 @@ class CommandSequence:
         """``seq`` of the current command; 0 before the mission starts.
 
         The command is ``commands[commands.next - 1]``, because the list begins with ``seq`` 1. Set ``next`` to change
-        the current command (0: restart the mission). Setting it does not wait.
+        the current command; 0 restarts the mission. Setting ``next`` does not wait.
         """
         return self._current.seq
 

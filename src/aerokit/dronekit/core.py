@@ -343,7 +343,7 @@ class VehicleCore(HasObservers):
         Args:
             types: names of attributes, including your own; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
                 ``'armed'``, ``'mode'`` and ``'attitude'``.
-            timeout: seconds; None: no limit.
+            timeout: seconds; None means no limit.
             raise_exception: if false, return False instead of raising the errors about missing values.
             still_waiting_callback: called with the missing names.
             still_waiting_interval: seconds between these calls.

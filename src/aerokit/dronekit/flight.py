@@ -197,8 +197,8 @@ class FlightMethods(VehicleAttributes):
         Args:
             location: latitude and longitude in degrees, and the altitude in metres above sea level (LocationGlobal) or
                 home (LocationGlobalRelative).
-            airspeed: m/s; like setting :attr:`airspeed`.
-            groundspeed: m/s; like setting :attr:`groundspeed`.
+            airspeed: in m/s; has the same effect as setting :attr:`airspeed`.
+            groundspeed: in m/s; has the same effect as setting :attr:`groundspeed`.
 
         Raises:
             ValueError: the location has another type, or one of its numbers is missing or wrong. Nothing was sent.
@@ -259,12 +259,13 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def home_location(self) -> LocationGlobal | Any:
-        """Home location, a new object each time; None until HOME_POSITION or a downloaded mission reports home.
+        """Home location; None until HOME_POSITION or a downloaded mission reports home, and after a reboot.
 
-        A reboot of the vehicle resets it to None.
+        Each access returns a new object.
 
-        Set it to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME). As in DroneKit, the attribute changes at once; a
-        refusal restores it. Raises ValueError, without sending, for another type or an invalid coordinate.
+        Set the attribute to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME). As in DroneKit, the attribute changes
+        at once; a refusal restores the old home. An invalid coordinate or another type raises ValueError, and nothing
+        is sent.
         """
         home = self._home_location
         return None if home is None else LocationGlobal(home.lat, home.lon, home.alt)

@@ -193,7 +193,7 @@ async def go_to(vehicle: AsyncVehicle, target: Target) -> None:
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
     """Return the modes in which DO_REPOSITION may be sent to PX4, which then changes to the first of them.
 
-    Empty for other autopilots, which refuse the command in unsuitable modes, and do not change the mode.
+    The result is empty for other autopilots, which refuse the command in unsuitable modes, and do not change the mode.
     """
     if not aio.autopilot.repositions_amsl:  # not PX4
         return ()
@@ -318,11 +318,14 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
 
     def send_calibrate_barometer(self) -> None:
-        """Store the current air pressure as that of altitude 0."""
+        """Store the current air pressure as the pressure at altitude 0."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:
-        """Calibrate the accelerometers in six poses, which STATUSTEXT messages request; with ``simple``, level only."""
+        """Calibrate the accelerometers in six poses, which STATUSTEXT messages request.
+
+        With ``simple``, calibrate them in the level pose only.
+        """
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:

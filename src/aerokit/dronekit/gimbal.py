@@ -27,8 +27,8 @@ class Gimbal(GimbalPrivates):
     """The first gimbal of a vehicle: its attitude, and orders to turn it.
 
     :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle reports a gimbal. Orders return immediately.
-    A newer order replaces an unanswered order. A rejection is logged as a warning of the logger ``dronekit``. Raises
-    ValueError for invalid numbers and locations, and APIException while the link is down.
+    A newer order replaces an unanswered order. A rejection is logged as a warning of the logger ``dronekit``. Orders
+    raise ValueError for invalid numbers and locations, and APIException while the link is down.
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
@@ -69,10 +69,12 @@ class Gimbal(GimbalPrivates):
     def rotate(self, pitch: float, roll: float, yaw: float) -> None:
         """Turn the gimbal to a direction, which it keeps while the vehicle moves.
 
+        With a roll other than 0, or for a vehicle without a gimbal manager, DO_MOUNT_CONTROL is sent. The camera then
+        points at ``yaw`` only at first, and afterwards turns with the vehicle.
+
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
-            roll: degrees from the horizon. With a roll other than 0, the camera points at ``yaw`` only at first, and
-                then turns with the vehicle, because DO_MOUNT_CONTROL is sent.
+            roll: degrees from the horizon.
             yaw: degrees clockwise from north.
         """
         pitch = _checked("pitch", pitch)

@@ -58,8 +58,8 @@ class ListenerThread:
     def call(self, function: Callable[..., object], *args: Any) -> None:
         """Queue a call and wait until it has run, at most two seconds.
 
-        Called from a listener, or after :meth:`stop`, run the function directly. Called on an event loop or on another
-        listener thread, only queue the call, because a wait could cause a deadlock.
+        On the listener thread, or after :meth:`stop`, this method runs the function directly. On an event loop or on
+        another listener thread, it only queues the call, because a wait could cause a deadlock.
         """
         if self.is_current or self.is_stopped:
             function(*args)

@@ -255,8 +255,8 @@ class Master:
 class Inbox(Mapping[str, Any]):
     """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    Messages are stored from the first access on. A look-up within one second of this access waits for the message.
-    Messages of radios and ground stations are included, but not those of other vehicles.
+    Messages are stored from the first access on. During the second after this access, a look-up waits until a message
+    of the type arrives. Messages of radios and ground stations are included, but not those of other vehicles.
     """
 
     def __init__(self, connection: ClassicConnection) -> None:

@@ -230,8 +230,8 @@ WAIT_TIMEOUT_S = 30.0
 class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers):
     """Maps names to values: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
-    Names are converted to upper case; values are floats. Old and new names of parameters that ArduPilot renamed both
-    work; values are converted, and a :class:`aerokit.parameters.ParameterRenamedWarning` is issued.
+    Names are converted to upper case; values are floats. A parameter that ArduPilot has renamed has its old and its new
+    name; values are converted, and a :class:`aerokit.parameters.ParameterRenamedWarning` is issued.
 
     All parameters are downloaded in the background after connecting, but not again after a reboot or a lost link.
     Changes that the vehicle reports are included. Reading a missing value requests only that value; iterating waits for
@@ -308,8 +308,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         Args:
             name: in any case.
             value: any number.
-            retries: how often the value is requested again, once a second, if the vehicle does not answer. With 0, the
-                method returns False at once, and a failure is logged as a warning later.
+            retries: how often the value is requested again if the vehicle does not answer: once a second, or less
+                often on a slow link. With 0, the method returns False at once, and a failure is logged later.
             wait_ready: wait for the download of all parameters first, which is not necessary.
 
         Returns:

@@ -213,8 +213,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
         Args:
             rate: Hz of the requested data streams; None requests none.
-            heartbeat_timeout: seconds to wait for the first heartbeat (0 or less: 30 s). Later, orders and waits raise
-                APIException after this many seconds without a heartbeat (0 or less: never).
+            heartbeat_timeout: seconds to wait for the first heartbeat; 0 or less means 30 s. Later, orders and waits
+                raise APIException after this many seconds without a heartbeat; 0 or less means never.
 
         Raises:
             APIException: no vehicle was found in time; the text describes what was received instead.
@@ -367,27 +367,28 @@ def connect(
     """Connect to a vehicle and return it after its first heartbeat.
 
     Args:
-        ip: connection string: ``'127.0.0.1:14550'`` and ``'udp:…'`` listen, ``'tcp:127.0.0.1:5760'``,
-            ``'/dev/ttyACM0'``, ``'com14'`` … (docs/addresses.md).
+        ip: connection string, such as ``'127.0.0.1:14550'`` or ``'udp:…'``, which both listen,
+            ``'tcp:127.0.0.1:5760'``, ``'/dev/ttyACM0'`` or ``'com14'`` (docs/addresses.md).
+        _initialize: False to return before the first heartbeat; then call :meth:`Vehicle.initialize`.
         wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a name or a list of
             names waits for these attributes. With None or False, ``connect`` does not wait.
         timeout: seconds for ``wait_ready``.
         still_waiting_callback: called with the set of missing names.
         still_waiting_interval: seconds between these calls.
-        status_printer: called with every STATUSTEXT of the autopilot, on the listener thread, until the vehicle is
-            closed.
+        status_printer: called on the listener thread, until the vehicle is closed, with every STATUSTEXT of the
+            autopilot that the level of the logger ``autopilot`` allows (by default, severity WARNING and above).
         vehicle_class: a subclass of :class:`Vehicle`.
         rate: Hz of the requested data streams; None requests none.
         baud: bits per second, for a serial port whose string has no baud rate.
-        heartbeat_timeout: seconds to wait for the first heartbeat (0: 30 s). Later, orders and waits raise APIException
-            after this many seconds without a heartbeat (0: never).
+        heartbeat_timeout: seconds to wait for the first heartbeat; 0 means 30 s. Later, orders and waits raise
+            APIException after this many seconds without a heartbeat; 0 means never.
         source_system: own system id, 1 to 255.
         source_component: own component id, 0 to 255.
         use_native: ignored.
         release_overrides: release RC channels that are still overridden when the connection ends. With False, overrides
             stay, as in DroneKit, until the vehicle ends them (ArduPilot: after RC_OVERRIDE_TIME).
-        heartbeat: content of our HEARTBEAT; None: no HEARTBEAT. It stops when the program has done nothing for 60 s
-            (see :class:`aerokit.OwnHeartbeat`): no attribute read, no order, no wait, and no return from a listener.
+        heartbeat: content of our HEARTBEAT; None sends none. Our HEARTBEAT stops when the program has done nothing for
+            60 s (see :class:`aerokit.OwnHeartbeat`): no attribute read, no order, no wait, no return from a listener.
 
     Raises:
         OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).

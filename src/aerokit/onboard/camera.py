@@ -43,7 +43,8 @@ class Photo(Snapshot):
     """A picture that a camera has taken.
 
     ``url`` is the address of the file for other programs: ``mftp:///DCIM/1.jpg`` for a file of `serve_files`, or an
-    HTTP address. The angles are those of the camera; the yaw is from north. None: unknown.
+    HTTP address. The angles are those of the camera in degrees, with the yaw from north. They are reported only if all
+    three are known. None means unknown.
     """
 
     url: str = ""
@@ -76,11 +77,12 @@ class CameraDriver:
         resolution: width and height of a picture, in pixels.
         focal_length_mm: NaN if unknown.
         sensor_mm: width and height of the sensor; NaN if unknown.
-        streams: addresses of video streams, ``rtsp://192.168.0.10:8554/main``.
+        streams: addresses of video streams, such as ``rtsp://192.168.0.10:8554/main``.
         has_modes: True if the camera takes pictures only in image mode and videos only in video mode
             (:meth:`set_mode`).
-        definition: camera definition file (XML) with the settings that aerokit serves by PARAM_EXT; None: no settings.
-        gimbal_id: component id of the gimbal that carries the camera; 0: none.
+        definition: camera definition file (XML) with the settings that aerokit serves by PARAM_EXT; None for no
+            settings.
+        gimbal_id: component id of the gimbal that carries the camera; 0 if there is none.
     """
 
     def __init__(
@@ -133,7 +135,7 @@ class CameraDriver:
         raise NotImplementedError
 
     async def zoom_at(self, rate: float) -> None:
-        """Zoom continuously: -1 (wide) to 1 (tele), 0 stops."""
+        """Zoom at a rate from -1 (towards wide) to 1 (towards tele) until the rate 0 stops the zoom."""
         raise NotImplementedError
 
     async def focus_to(self, percent: float) -> None:
@@ -141,7 +143,7 @@ class CameraDriver:
         raise NotImplementedError
 
     async def focus_at(self, rate: float) -> None:
-        """Move the focus at a rate from -1 (towards near) to 1 (towards far) until the rate 0 stops it."""
+        """Move the focus at a rate from -1 (towards near) to 1 (towards far) until the rate 0 stops the focus."""
         raise NotImplementedError
 
     async def focus_distance(self, metres: float) -> None:

@@ -67,10 +67,11 @@ class CommandRequest:
 
     @property
     def position(self) -> Position:
-        """Position of the command, with the altitude above home or above mean sea level.
+        """Position of the command. Its altitude is above home or above mean sea level, depending on the frame.
 
         Raises:
-            InvalidArgument: latitude or longitude is missing or out of range, or the frame has another altitude.
+            InvalidArgument: latitude or longitude is missing or out of range, or the altitude is relative to something
+                else, such as the terrain.
         """
         frame = self._command.altitude_frame
         *_, latitude, longitude, altitude = self.params

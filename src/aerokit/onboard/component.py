@@ -142,7 +142,7 @@ class OnboardComponent:
         """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
-            state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
+            state: MAV_STATE, such as ACTIVE, STANDBY, CALIBRATING or CRITICAL.
             base_mode: MAV_MODE_FLAG; None leaves it unchanged.
             custom_mode: mode number of this component, 0 to 4294967295; None leaves it unchanged.
 
@@ -174,8 +174,8 @@ class OnboardComponent:
         """Decorator: execute a MAV_CMD by a function or coroutine function.
 
         The function's first argument is the :class:`~aerokit.onboard.CommandRequest`. The other arguments are the
-        command's parameters in order, unless :class:`~aerokit.onboard.Param` numbers them. Annotate each argument with
-        float, int, bool or an enum. Add ``| None`` if the parameter may be missing, and limit its range by
+        command's parameters in order, unless :class:`~aerokit.onboard.Param` selects others. Annotate each argument
+        with float, int, bool or an enum. Add ``| None`` if the parameter may be missing, and limit its range by
         ``Annotated[float, Range(0, 50)]``. A command whose values do not fit is DENIED, and the function is not called.
 
         The function returns None or True for ACCEPTED, False for FAILED, a MAV_RESULT, or a
@@ -392,10 +392,10 @@ class OnboardComponent:
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
 
         Args:
-            authorize: function or coroutine function, called with the vehicle's system id. The function returns the
-                number of seconds for which arming is allowed, at most 255. An exception denies arming, and its text is
-                sent as a status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
-                MAV_ARM_AUTH_DENIED_REASON as ``detail``.
+            authorize: function or coroutine function, called with the vehicle's system id. The function returns for
+                how many seconds arming is allowed (above 0, at most 255). An exception denies arming, and its text is
+                sent as a status text. To deny with a MAV_ARM_AUTH_DENIED_REASON, the function returns a
+                :class:`~aerokit.onboard.CommandResult` with the result DENIED and the reason as ``detail``.
 
         Raises:
             InvalidArgument: the component already has an arm authorizer.

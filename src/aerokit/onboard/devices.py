@@ -37,8 +37,8 @@ class WinchDriver:
     """Base class for your program's winch; pass an instance to :meth:`OnboardComponent.add_winch`.
 
     Override the coroutines for the actions that the winch has; other actions are UNSUPPORTED. A coroutine must return
-    only when its action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command. The winch
-    action HOLD cancels it, too.
+    only when its action has ended. Until then, the sender gets IN_PROGRESS, and the coroutine is cancelled by
+    COMMAND_CANCEL or by the winch action HOLD.
     """
 
     async def relax(self) -> None:
@@ -52,7 +52,8 @@ class WinchDriver:
     async def set_rate(self, rate_m_s: float) -> None:
         """Wind the line out (positive rate) or in (negative rate) until the next command.
 
-        If the line still runs at the end of the component's block, aerokit calls :meth:`hold`, or this method with 0.
+        If the line still runs when the component's block ends, aerokit calls :meth:`hold` or, if the winch does not
+        implement it, this method with 0.
         """
         raise NotImplementedError
 

@@ -89,7 +89,7 @@ class GimbalDriver:
     def point(self, target: GimbalTarget) -> None:
         """Start to turn to a target within the limits. Called on the event loop, so it must return at once.
 
-        Rates last until the next target. At the end of the component's block, they are set to zero.
+        Rates last until the next target. When the component's block ends, aerokit calls this method with rates of zero.
         """
         raise NotImplementedError
 

@@ -52,9 +52,9 @@ class ComponentMissions:
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
-        the result INVALID and a status text. The function may be a coroutine function. An empty list is a request to
-        clear the list.
+        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises an exception. Its text is sent
+        as a status text, and the result is INVALID for InvalidArgument and ValueError, otherwise ERROR. The function
+        may be a coroutine function. An empty list is a request to clear the list.
         """
         self._on_upload = function
         return function

@@ -61,15 +61,15 @@ async def component(
             component and a ground station. The arguments after ``accepts`` are then not allowed.
         system_id: system id of the component, 1 to 255. Use the system id of the vehicle that carries the component.
         component_id: component id (MAV_COMPONENT), 1 to 255.
-        type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
+        type: MAV_TYPE of the heartbeat, such as ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH or GRIPPER.
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
         identity: vendor, model and versions that the component reports.
         parameters_file: JSON file that stores the parameters; the file is replaced atomically after each change. With
             None, parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
-            ``autopilot`` of HEARTBEAT expect bytewise encoding.
-        accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
+            ArduPilot does. The component's capabilities announce the encoding. Some clients ignore them and expect the
+            bytewise encoding of all systems that HEARTBEAT does not report as ArduPilot.
+        accepts: system ids whose messages are processed; None means all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.
         mavlink_version: version of sent messages, 1 or 2.

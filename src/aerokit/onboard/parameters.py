@@ -93,8 +93,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             name: 1 to 16 ASCII characters without spaces.
             default: value until another program or :meth:`set` changes it. A value in the parameters file takes
                 precedence.
-            minimum: minimum of a number; None: the minimum of the type.
-            maximum: maximum of a number; None: the maximum of the type.
+            minimum: minimum of a number; None means the minimum of the type.
+            maximum: maximum of a number; None means the maximum of the type.
             unit: unit for the metadata, such as ``"m/s"``.
             description: description for the metadata.
             values: maps each allowed number to its name; other numbers are refused.

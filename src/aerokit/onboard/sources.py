@@ -93,7 +93,7 @@ class ComponentSources:
         emitter_type: int = 0,
         age_s: int = 0,
     ) -> None:
-        """Report an aircraft that a receiver has detected (ADSB_VEHICLE).
+        """Report an aircraft that a receiver has detected (ADSB_VEHICLE). None means that a value is unknown.
 
         Args:
             icao: ICAO address, 0 to 16777215.

@@ -75,7 +75,7 @@ class CongestionWindow:
 
 
 class BlockRequests(PendingRequests[int]):
-    """Requests for blocks, whose keys are their offsets. An adaptive window limits the number of requests in flight.
+    """Requests for blocks, identified by their offsets. An adaptive window limits the number of requests in flight.
 
     Requests are sent without delay if fewer than ``batch_size`` are in flight, otherwise ``spacing_s`` seconds apart. A
     request is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.

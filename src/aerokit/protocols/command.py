@@ -34,7 +34,10 @@ MAX_ATTEMPTS = 4
 
 
 class Repetition(NamedTuple):
-    """Further effect of a repeated command. If ``param`` (1 to 7) is given, only if that parameter equals ``value``."""
+    """Further effect of a repeated command.
+
+    With a ``param`` (1 to 7), the command has this effect only if that parameter equals ``value``.
+    """
 
     effect: str
     param: int | None = None
@@ -181,7 +184,7 @@ class CommandExchange(Exchange[CommandAck]):
 
     Without an ``order_status``, the command is repeated every ``attempt_timeout`` seconds. With an ``order_status``,
     each repetition waits for a new HEARTBEAT, so a silent vehicle gets none. Once ``order_status.end`` has a text, the
-    command is not repeated any more.
+    exchange fails with that text instead of repeating the command.
 
     Acknowledgements to other ground stations, or from other components than the target, are ignored.
 
@@ -189,12 +192,13 @@ class CommandExchange(Exchange[CommandAck]):
         message: the command.
         own_system: our system id.
         own_component: our component id.
-        attempts: maximum number of transmissions; None: 4, or 1 for a command in `UNREPEATABLE_COMMANDS`.
-        attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for a command in `UNREPEATABLE_COMMANDS`.
+        attempts: maximum number of transmissions. None means 4, or 1 if a repetition would have a further effect
+            (`allowed_attempts`).
+        attempt_timeout: seconds for each attempt. None means 1 s, or 4 s if ``attempts=None`` allows one attempt.
         progress_timeout: seconds from an IN_PROGRESS until the command fails, unless another answer arrives.
-        on_progress: called at each IN_PROGRESS with 0–100, or None if the vehicle does not report a percentage.
+        on_progress: called at each IN_PROGRESS with 1–100, or None if the vehicle does not report a percentage.
         earlier_acks: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with
-            the same MAV_CMD. Once this command was repeated, every acknowledgement counts.
+            the same MAV_CMD. No acknowledgement is ignored if ``attempts`` is 1, or once this command was repeated.
         acks_per_sending: number of acknowledgements that the vehicle sends for each transmission; the first one counts.
         min_timeout_s: lower limit of ``attempt_timeout``, for slow links.
         order_status: determines whether the command may be repeated; None if nothing prevents it.
@@ -202,8 +206,8 @@ class CommandExchange(Exchange[CommandAck]):
 
     Raises from ``result()``:
         CommandRejected: the result is neither ACCEPTED nor IN_PROGRESS. The caller adds status texts of the vehicle.
-        CommandTimeout: no acknowledgement arrived within ``attempts`` times ``attempt_timeout`` seconds, or none
-            followed an IN_PROGRESS within ``progress_timeout`` seconds.
+        CommandTimeout: no acknowledgement arrived within ``attempts`` times ``attempt_timeout`` seconds, or before
+            ``order_status`` ended the repetitions, or within ``progress_timeout`` seconds after an IN_PROGRESS.
     """
 
     expects: tuple[type[Message], ...] = (CommandAck,)

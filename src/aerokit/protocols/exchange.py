@@ -129,7 +129,8 @@ class RoundTrip:
 
     Only answers to requests that were sent once are measured (Karn's algorithm), because an answer after a retry may
     belong to either transmission. ``link_s`` returns the link's latest round-trip time as TIMESYNC measures it, or
-    None. A much shorter time is not measured, because the answer must belong to an earlier request.
+    None. An answer that arrives in much less than this time is not measured, because it must belong to an earlier
+    request.
     """
 
     def __init__(
@@ -366,9 +367,9 @@ class StaleAnswerFilter:
     def is_stale(self, name: str, sent_at: float, now: float, *, may_measure: bool) -> bool:
         """Return True if ``now`` is too early for an answer to the request for ``name`` sent at ``sent_at``.
 
-        ``may_measure`` is True if the time may be a round trip of the link. For each name, True is returned for at most
-        MAX_EARLY_ANSWERS requests; after that, the vehicle counts as faster than before. The caller must also check the
-        answer in other ways, because it may be meant for another station.
+        ``may_measure`` is True if the time may be a round trip of the link. After MAX_EARLY_ANSWERS requests for a name
+        were answered early, the vehicle counts as faster than before, and the result is False. The caller must also
+        check the answer in other ways, because it may be meant for another station.
         """
         elapsed_s = now - sent_at
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):

@@ -255,7 +255,7 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
-        """Write or read again. Enough equal answers end the write instead."""
+        """Write or read again, or end the write after enough equal answers."""
         self._repeated_answers.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
         if not self._repeated_answers.are_conclusive(is_unchanged=is_unchanged):

@@ -243,7 +243,8 @@ class FtpClient:
     def next_sequence(self, replies: int = 1) -> int:
         """Return the sequence number of a new request.
 
-        The replies have the next ``replies`` numbers. The next request has the same number as the last reply.
+        ``replies`` replies are expected, with the numbers that follow. The next request has the number of the last
+        reply.
         """
         sequence = self._sequence % SEQUENCE_COUNT
         self._sequence = sequence + replies

@@ -6,8 +6,8 @@ Behaviour of servers (ArduPilot 4.7, PX4 1.17) that determines this design:
   meanwhile; it queues five requests and drops further ones. PX4 answers reads during a burst, and a new burst request
   replaces the current burst. Missing blocks are therefore requested as soon as they are noticed: four at a time during
   a burst, more afterwards.
-- Requests are always for whole blocks at multiples of the block size: ``@PARAM/param.pck`` is packed for one block
-  size.
+- Requests are always for whole blocks at multiples of the block size, because the vehicle pads ``@PARAM/param.pck`` so
+  that no value crosses the end of a block.
 - The size that ArduPilot reports for files whose names begin with ``@`` is an estimate. Only the EOF error is reliable.
 - A burst ends with a NAK that has the EOF error. If the last block was full, ArduPilot's NAK has the offset of this
   block.
@@ -360,9 +360,10 @@ class FtpUpload(FtpExchange[None]):
     """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged.
 
     With ``first_block_last``, the first block is sent when all others are acknowledged. When a virtual file, whose
-    name begins with ``@``, is closed, ArduPilot evaluates it even if the upload was interrupted. Of an incomplete
-    ``@PARAM/param.pck``, it sets all parameters that have arrived, one of them to 0 or to a part of its value
-    (AP_Filesystem_Param.cpp, param_upload_parse). It ignores a file without the magic number in the first block.
+    name begins with ``@``, is closed, ArduPilot evaluates it even if the upload was interrupted. From an incomplete
+    ``@PARAM/param.pck``, it would set all parameters that have arrived, and an incomplete one to 0 or to a part of its
+    value (AP_Filesystem_Param.cpp, param_upload_parse). Without the magic number in the first block, it ignores the
+    file.
     """
 
     def __init__(

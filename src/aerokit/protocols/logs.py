@@ -2,8 +2,8 @@
 
 Behaviour of vehicles (ArduPilot 4.7, PX4 1.17) that determines this design:
 
-- ArduPilot sends the blocks of one range and ignores further requests meanwhile. A single block is sent immediately, so
-  that many can be requested. PX4 drops the previous request; over UDP it sends 256 kB in one burst, regardless of
+- ArduPilot ignores further requests while it sends the blocks of a range. It sends a single block immediately, and can
+  then answer the next request. PX4 drops the previous request; over UDP it sends 256 kB in one burst, regardless of
   losses. Therefore only one long range is requested at a time. Once it has ended, its gaps are requested: long gaps as
   ranges, single blocks many at a time with a short delay between them. Ranges become shorter if most of their blocks
   are lost.
@@ -222,7 +222,7 @@ class LogDownload(Transfer[int]):
 class LogStop(Transfer[None]):
     """Repeats LOG_REQUEST_END, which is not acknowledged, until the vehicle sends no more log data.
 
-    The caller sends the first one (`message`).
+    The caller sends the first LOG_REQUEST_END (`message`).
     """
 
     expects: tuple[type[Message], ...] = (LogData, LogEntry)
@@ -258,7 +258,8 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     Args:
         first_id: the id of this autopilot's oldest log.
-        max_unanswered: number of unanswered requests after which to fail; None: fail only after ``idle_timeout_s``.
+        max_unanswered: the transfer fails after this number of unanswered requests. None means that it fails only after
+            ``idle_timeout_s``.
     """
 
     expects: tuple[type[Message], ...] = (LogEntry,)

@@ -255,7 +255,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._succeed(now, is_confirmed=is_confirmed, opaque_id=opaque_id)
 
     def _is_answer_to_copy(self, result: int, now: float) -> bool:
-        """Return True if ArduPilot has received MISSION_WRITE_PARTIAL_LIST twice. It continues the transfer."""
+        """Return True if ``result`` answers a second copy of MISSION_WRITE_PARTIAL_LIST. The upload then continues."""
         # ArduPilot answers the second one by DENIED (MissionItemProtocol.cpp, handle_mission_write_partial_list). After
         # TRANSFER_EXPIRY_S, DENIED may instead be about another station's transfer.
         is_recent = now - self._progress_at < TRANSFER_EXPIRY_S

@@ -251,7 +251,7 @@ class NamedReads(NamedRequests[ValueT]):
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 
     def _reject_if_requested_often(self, names: Iterable[str], now: float) -> None:
-        """Reject the names whose answers cannot all have been lost."""
+        """Reject the names that were requested so often that their answers cannot all have been lost."""
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
                 text = f"{self.unknown_text} {name}: it answers requests for other names, but not for this one"

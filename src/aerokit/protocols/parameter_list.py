@@ -22,7 +22,10 @@ __all__ = ["ParameterList", "merge_update"]
 
 
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
-    """Merge a PARAM_VALUE that is not part of a list into a known parameter."""
+    """Merge a PARAM_VALUE that is not part of a list into a known parameter.
+
+    Unless the vehicle encodes integers ``bytewise``, a known integer type and a known large integer are kept.
+    """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
         is_whole = float(value).is_integer()

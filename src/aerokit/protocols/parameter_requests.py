@@ -260,7 +260,7 @@ class ParameterWrites(ParameterRequests):
         self._on_unexpected_value(name, reported, now, is_as_requested=is_as_requested)
 
     def _on_unexpected_value(self, name: str, reported: Parameter, now: float, *, is_as_requested: bool) -> None:
-        """Write or read again. Enough equal answers end the write instead.
+        """Write or read again, or end the write after enough equal answers.
 
         With ``is_as_requested``, only the type of the value is unexpected.
         """

@@ -31,7 +31,7 @@ LOSS_THRESHOLD = 3
 
 
 class PendingRequest:
-    """Times and numbers of a request's transmissions. All requests share one count of transmissions."""
+    """Times and numbers of a request's transmissions. The transmissions of all requests are numbered together."""
 
     __slots__ = (
         "attempts", "due_at", "first_at", "first_number", "last_number", "previous_sent_at", "sent_at",
@@ -100,8 +100,8 @@ class RequestWindow(PendingRequests[KeyT]):
     """Requests, each identified by a key, with a limit on the number in flight.
 
     The limit is ``size`` at first, and grows to ``max_size`` while answers do not become slower. A request is repeated
-    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first. ``duplicate_last``
-    sends each of the last few requests as two copies from the third attempt on.
+    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first. With
+    ``duplicate_last``, when only a few requests are left, each is sent as two copies from its third attempt on.
     """
 
     def __init__(

@@ -71,7 +71,7 @@ class VehicleSigning:
         return True
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        """Return the function that decides which unsigned frames a port accepts. None accepts none."""
+        """Return the function that decides which unsigned frames a port accepts; None if the port accepts none."""
         raise NotImplementedError
 
     def may_change(self) -> bool:
@@ -242,7 +242,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         self.reboot(_REBOOT_SILENCE_S)
 
     def on_speedup(self, speedup: float) -> None:
-        """Multiply the timeouts that are not parameters. Called by `aerokit.sim.kinds.scale_timeouts`."""
+        """Multiply the timeouts that are not parameters by ``speedup``. `aerokit.sim.kinds.scale_timeouts` calls it."""
 
     def open_channel(self, *, version: int = 2) -> Channel:
         """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""

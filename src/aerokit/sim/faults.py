@@ -83,14 +83,14 @@ class Faults:
     def refuse(
         self, command: int, result: int = MavResult.DENIED, text: str | None = None, *, times: int | None = None
     ) -> None:
-        """Answer the next ``times`` commands of this MAV_CMD (None: all) with a MAV_RESULT, without executing them.
+        """Answer the next ``times`` commands of this MAV_CMD (None: all) with a MAV_RESULT, but do not execute them.
 
-        ``text`` is sent as a status text before the answer.
+        ``text`` is sent as a status text before each answer.
         """
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)
 
     def ignore(self, command: int, *, times: int | None = None) -> None:
-        """Neither execute nor acknowledge the next ``times`` commands of this MAV_CMD. None: all."""
+        """Neither execute nor acknowledge the next ``times`` commands of this MAV_CMD (None: all)."""
         self.commands[command] = CommandFault(times, ignore=True)
 
     def lose_ack(self, command: int, *, times: int | None = 1) -> None:

@@ -34,8 +34,8 @@ class SimulatorServer:
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
     second. After the loop was blocked, the server simulates the missed time. With a ``speedup`` other than 1, the
-    server simulates at most half a second and skips the rest. Otherwise, missing heartbeats would look like a link
-    loss.
+    server simulates at most half a second of it and skips the rest, because the vehicles would take a longer time
+    without heartbeats for a loss of the link.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.

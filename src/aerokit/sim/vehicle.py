@@ -259,7 +259,10 @@ class SimulatedVehicle:
         return False
 
     def call_at(self, when: float, action: Callable[[], None], *, owner: object = None) -> None:
-        """Call a function at a simulated time. A reboot of the owner, a component or None (the vehicle), cancels it."""
+        """Call a function at a simulated time.
+
+        ``owner`` is a component, or None for the vehicle. A reboot of the owner cancels the call.
+        """
         self._timer_count += 1
         heappush(self._timers, (when, self._timer_count, action, owner))
 

@@ -84,8 +84,8 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
             name: 1 to 16 ASCII characters without spaces.
             default: value until another program or :meth:`set` changes it. A value in the parameters file takes
                 precedence.
-            minimum: minimum of a number; None: the minimum of the type.
-            maximum: maximum of a number; None: the maximum of the type.
+            minimum: minimum of a number; None means the minimum of the type.
+            maximum: maximum of a number; None means the maximum of the type.
             unit: unit for the metadata, such as ``"m/s"``.
             description: description for the metadata.
             values: maps each allowed number to its name; other numbers are refused.
@@ -165,9 +165,9 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
     ) -> Callable[[str, tuple[MissionItem, ...]], Any]:
         """Decorator: ``function(kind, items)`` accepts or refuses each upload, before it is stored and acknowledged.
 
-        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises InvalidArgument, which becomes
-        the result INVALID and a status text. The function may be a coroutine function. An empty list is a request to
-        clear the list.
+        To refuse a list, the function returns False or a MAV_MISSION_RESULT, or raises an exception. Its text is sent
+        as a status text, and the result is INVALID for InvalidArgument and ValueError, otherwise ERROR. The function
+        may be a coroutine function. An empty list is a request to clear the list.
         """
         return self._loop.call(self.aio.on_upload, function)
 
@@ -251,7 +251,7 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
         emitter_type: int = 0,
         age_s: int = 0,
     ) -> None:
-        """Report an aircraft that a receiver has detected (ADSB_VEHICLE).
+        """Report an aircraft that a receiver has detected (ADSB_VEHICLE). None means that a value is unknown.
 
         Args:
             icao: ICAO address, 0 to 16777215.
@@ -348,7 +348,7 @@ class OnboardComponent(ComponentTwin):
         """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
-            state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
+            state: MAV_STATE, such as ACTIVE, STANDBY, CALIBRATING or CRITICAL.
             base_mode: MAV_MODE_FLAG; None leaves it unchanged.
             custom_mode: mode number of this component, 0 to 4294967295; None leaves it unchanged.
 
@@ -493,10 +493,10 @@ class OnboardComponent(ComponentTwin):
         """Answer ARM_AUTHORIZATION_REQUEST (https://mavlink.io/en/services/arm_authorization.html).
 
         Args:
-            authorize: function or coroutine function, called with the vehicle's system id. The function returns the
-                number of seconds for which arming is allowed, at most 255. An exception denies arming, and its text is
-                sent as a status text. To give a reason, return a :class:`~aerokit.onboard.CommandResult` with a
-                MAV_ARM_AUTH_DENIED_REASON as ``detail``.
+            authorize: function or coroutine function, called with the vehicle's system id. The function returns for
+                how many seconds arming is allowed (above 0, at most 255). An exception denies arming, and its text is
+                sent as a status text. To deny with a MAV_ARM_AUTH_DENIED_REASON, the function returns a
+                :class:`~aerokit.onboard.CommandResult` with the result DENIED and the reason as ``detail``.
 
         Raises:
             InvalidArgument: the component already has an arm authorizer.
@@ -550,15 +550,15 @@ def component(
             component and a ground station. The arguments after ``accepts`` are then not allowed.
         system_id: system id of the component, 1 to 255. Use the system id of the vehicle that carries the component.
         component_id: component id (MAV_COMPONENT), 1 to 255.
-        type: MAV_TYPE of the heartbeat: ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH, GRIPPER …
+        type: MAV_TYPE of the heartbeat, such as ONBOARD_CONTROLLER, CAMERA, GIMBAL, WINCH or GRIPPER.
         autopilot: MAV_AUTOPILOT of the heartbeat; INVALID for everything that is not a flight controller.
         identity: vendor, model and versions that the component reports.
         parameters_file: JSON file that stores the parameters; the file is replaced atomically after each change. With
             None, parameters are not stored.
         bytewise: True to encode integers in PARAM_VALUE bytewise, as PX4 does; False to cast them to float, as
-            ArduPilot does. The component's capabilities announce the encoding. Clients that decide by the field
-            ``autopilot`` of HEARTBEAT expect bytewise encoding.
-        accepts: system ids whose messages are processed; None: all. Without signing, senders can claim any id.
+            ArduPilot does. The component's capabilities announce the encoding. Some clients ignore them and expect the
+            bytewise encoding of all systems that HEARTBEAT does not report as ArduPilot.
+        accepts: system ids whose messages are processed; None means all. Without signing, senders can claim any id.
         baud: bits per second of a serial link whose address has none.
         dialect: the messages that are decoded.
         mavlink_version: version of sent messages, 1 or 2.

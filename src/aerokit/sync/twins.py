@@ -4027,7 +4027,7 @@ class Vehicle(VehicleTwin):
             attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
                 trips if necessary. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
-            on_progress: called for each IN_PROGRESS with the progress, 0–100 or None if unknown.
+            on_progress: called for each IN_PROGRESS with the progress, 1–100 or None if unknown.
 
         Raises:
             InvalidArgument: a parameter has the wrong type or is too large for its field. Nothing was sent.

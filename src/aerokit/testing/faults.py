@@ -106,7 +106,7 @@ class FaultInjector:
         self._schedule(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
 
     def end(self, *, after_s: float = 0.0) -> None:
-        """End the faults of GPS, radios, motor and processor."""
+        """End the faults of GPS, radios, motor and autopilot. Wind, battery and failing arming checks stay."""
         for name in ("gps_lost", "rc_lost", "motor_failed", "silent", "frozen"):
             self._set(name, False, after_s)
         self.drop_packets(0.0, after_s=after_s)

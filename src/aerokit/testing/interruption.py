@@ -21,7 +21,8 @@ class Interruption:
     """Raises KeyboardInterrupt in the main thread, but only within a block of `allowed`.
 
     Python may run the signal handler while the block is being entered or left, when no code would catch the exception.
-    The handler then raises nothing, and the signal is sent again while the block lasts. No signal arrives after it.
+    The handler then raises nothing, and the signal is sent again while the block lasts. No signal arrives after the
+    block.
     """
 
     def __init__(self) -> None:

@@ -98,8 +98,7 @@ class ServedFlight:
 
 @contextmanager
 def serve_flight(kind: str = "copter", **options: Any) -> Iterator[ServedFlight]:
-    """Serve a vehicle while the block runs; ``options`` are the options of the vehicle and of `hosted_flight`.
-
+    """Serve a vehicle while the block runs; ``options`` are the options of `hosted_flight` and of the vehicle.
     An exception in the simulated vehicle ends the block at once, see `ServedFlight.raising_vehicle_errors`.
     """
     with hosted_flight(kind, **options) as flight, flight.raising_vehicle_errors():
@@ -115,11 +114,12 @@ def hosted_flight(
     record: bool = False,
     **options: Any,
 ) -> Iterator[ServedFlight]:
-    """Serve a vehicle on an address while the block runs. ``options`` are the options of the vehicle.
+    """Serve a vehicle on an address, at ``speedup`` times real time, while the block runs.
 
-    The vehicle's timeouts are scaled as by `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind
-    or address, and LinkOpenError if the address cannot be opened. If the simulated vehicle has raised an exception, the
-    end of the block raises it.
+    ``record=True`` records the link for the report of a failed test. ``options`` are those of the vehicle; its timeouts
+    are scaled as by `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, and
+    LinkOpenError if the address cannot be opened. If the simulated vehicle has raised an exception, the end of the
+    block raises it.
     """
     from anyio.from_thread import start_blocking_portal
 

@@ -172,9 +172,10 @@ def command_action(
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
     """Return the ``run`` function of a command that performs one action and then prints one line.
 
-    The line is ``text``, or with ``--json`` a ``done`` record with ``name``. Options named in braces are replaced in
-    both. ``action`` is called with a target and the options; the target is the vehicle, or what ``open_target`` yields.
-    With a ``question``, the command has the option ``--yes``, and asks the user for confirmation before it connects.
+    The line is ``text``, or with ``--json`` a ``done`` record with ``name``. In ``text`` and ``name``, the name of an
+    option in braces is replaced by the option's value. ``action`` is called with a target and the options; the target
+    is the vehicle, or what ``open_target`` yields. With a ``question``, the command asks the user for confirmation
+    before it connects; the caller adds its option ``--yes``, which answers the question.
     """
 
     async def run(options: argparse.Namespace) -> int:

@@ -83,7 +83,10 @@ class _StillnessNearGround:
         self._still_since = vehicle.connection.now()
 
     def has_lasted(self) -> bool:
-        """Consider the vehicle's latest position. Call this regularly."""
+        """Evaluate the latest position, and return True if the vehicle has not moved for long enough.
+
+        Call this method regularly.
+        """
         now = self._vehicle.connection.now()
         position = self._vehicle.position.latest
         if position is None:

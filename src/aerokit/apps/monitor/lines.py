@@ -39,7 +39,7 @@ _LABEL_PADDING = 2
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
-    """Format a number, or None as unknown.
+    """Format a number; None becomes "—".
 
     ``sign`` is as in Python's format specification. A number that rounds to 0 has no sign.
     """
@@ -150,7 +150,7 @@ class VehicleText:
         return text.append_text(self.silence(is_short=True))
 
     def silence(self, *, is_short: bool = False) -> Text:
-        """Say how long the vehicle has been silent; empty if it is not silent."""
+        """Return a text about how long the vehicle has been silent. It is empty if the vehicle is not silent."""
         if self._link_state is None or not self._silent_s:
             return Text()
         note = "" if is_short else "; values are from before"

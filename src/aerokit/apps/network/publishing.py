@@ -58,7 +58,7 @@ class Publishing:
     Args:
         vehicle: a connected vehicle.
         publisher: the network to publish to.
-        states: names of the states to publish; empty: all.
+        states: names of the states to publish; if empty, all states are published.
     """
 
     published: int
@@ -129,7 +129,7 @@ async def publishing(
         to: ``"zenoh://fleet/alpha"`` for the keys ``aerokit/fleet/alpha/state/SYSTEM_ID/STATE``,
             ``"mqtt://host/fleet/alpha"`` for topics of the same names, or a `Publisher`.
         rate_hz: maximum rate of each state, above 0, at most 50.
-        states: names of states to publish (docs/states.md), or ``"link"``; empty: all.
+        states: names of states to publish (docs/states.md), or ``"link"``; if empty, all states are published.
 
     Raises:
         InvalidArgument: an argument is invalid, or there is no such state.

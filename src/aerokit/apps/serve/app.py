@@ -106,11 +106,11 @@ def make_app(
     Args:
         source: a connection (its vehicles are served when they appear), one vehicle, or a mapping of system ids to
             vehicles. The application does not close them; close them after the application has ended.
-        token: 16 to 256 characters of A-Z, a-z, 0-9, - . _ ~; None: a random token, in ``app.token``.
+        token: 16 to 256 characters of A-Z, a-z, 0-9, - . _ ~. None creates a random token, which is in ``app.token``.
         read_only: reject all orders.
         open_reading: allow reading without the token; orders always need it.
         hosts: host names that browsers may use, besides ``localhost`` and IP addresses.
-        tiles: URL template of a tile server, ``https://tiles.example/{z}/{x}/{y}.png``; None: no tiles.
+        tiles: URL template of a tile server, such as ``https://tiles.example/{z}/{x}/{y}.png``; None for no tiles.
         attribution: attribution of the tiles, shown on the map.
         metadata: units, ranges and descriptions of parameters (:func:`aerokit.parameters.load_metadata`), for vehicles
             that do not provide any.

@@ -329,11 +329,12 @@ class OrderRunner:
     def submit(
         self, vehicle: Vehicle, order_type: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
     ) -> OrderRecord:
-        """Start an order, or return the earlier order with this key.
+        """Start an order. If the same order was already submitted with this key, return the earlier order.
 
         The caller must have checked the arguments with ``order_type.check``.
 
-        Raises HttpProblem for a missing or used key, an outdated ``seen_at_s``, or a ``force`` that is not allowed.
+        Raises HttpProblem if the key is missing or was used for another order or long ago, ``seen_at_s`` is outdated,
+        or a ``force`` is not allowed.
         Raises InvalidArgument or FileFormatError if the arguments cannot be parsed, BusyError if too many orders are
         running, HeartbeatTimeout if the vehicle is silent, and ConnectionClosed or LinkLost if the connection has
         ended.

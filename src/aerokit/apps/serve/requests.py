@@ -144,7 +144,7 @@ def query_flag(request: Request, name: str, *, default: bool) -> bool:
 
 
 def seen_at(request: Request) -> float | None:
-    """Return the header Aerokit-Seen-At, the time of the client's newest state message."""
+    """Return the header Aerokit-Seen-At, the time of the client's newest state message; None without the header."""
     text = request.headers.get("aerokit-seen-at")
     if text is None:
         return None

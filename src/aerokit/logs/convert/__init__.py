@@ -90,9 +90,9 @@ def convert(
     The target gets its name only when it is complete. The function blocks; it needs no event loop.
 
     Args:
-        log: a ``.tlog`` of a ground station, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
-        target: a file, ``.mcap``, ``.csv``, ``.parquet``, ``.gpx`` or ``.kml``; without a suffix, a folder with
-            one table for each message type.
+        log: a ``.tlog`` of a ground station, a ``.bin`` of ArduPilot, or a ``.ulg`` of PX4.
+        target: a file with the suffix ``.mcap``, ``.csv``, ``.parquet``, ``.gpx`` or ``.kml``. A name without a suffix
+            becomes a folder with one table for each message type.
         tables: format of the tables in a folder: ``"csv"`` or ``"parquet"``.
         force: replace existing files. Other files in a target folder stay.
         on_progress: called from time to time with the number of bytes read so far.

@@ -79,8 +79,8 @@ def read_flight(
     The function blocks and needs no event loop.
 
     Args:
-        log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
-        system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None: the first vehicle.
+        log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, or a ``.ulg`` of PX4.
+        system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None selects the first vehicle.
         on_progress: called from time to time with the number of bytes read so far.
 
     Raises:

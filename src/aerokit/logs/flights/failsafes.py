@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe or, if ``acted`` is False, a warning to which the autopilot did not certainly react."""
+    """A failsafe or, if ``acted`` is False, a warning to which the autopilot may not have reacted."""
 
     time_s: float
     kind: str

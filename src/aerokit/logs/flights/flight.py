@@ -280,7 +280,7 @@ class FlightLog:
         return self.modes[index - 1].name if index else ""
 
     def item_label(self, item: Waypoint) -> str:
-        """Return the number to show for a mission item. ArduPilot's item 0 is "home", so its item 1 is shown as 0."""
+        """Return the label of a mission item: its number without home. ArduPilot's item 0 is "home", its item 1 "0"."""
         if self.autopilot != "ArduPilot":
             return str(item.number)
         return str(item.number - 1) if item.number else "home"
@@ -320,7 +320,8 @@ class FlightLog:
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
         """Record home, if it is valid.
 
-        Until the first arming, ArduPilot moves home with the vehicle. From two seconds after it, a known home is kept.
+        Until the first arming, ArduPilot moves home with the vehicle. From two seconds after the first arming on, a
+        known home is kept.
         """
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
         if not is_valid:  # NaN is not valid, because it fails the comparisons

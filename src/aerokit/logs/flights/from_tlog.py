@@ -200,7 +200,7 @@ class _Reader:
         self._finish()
 
     def _is_time_damaged(self, unix_s: float) -> bool:
-        """Judge a time after a jump: it is damaged, unless the last skipped record has about the same time."""
+        """Return True if a time after a jump is damaged. It is not if the last skipped record has about that time."""
         if abs(unix_s - self._doubtful_unix_s) <= _DOUBTFUL_JUMP_S:
             self._damaged -= 1  # the clock has jumped, so the skipped record was not damaged
             return False

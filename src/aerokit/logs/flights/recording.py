@@ -79,9 +79,9 @@ class LinkCounter:
         self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
-        """Count received and lost frames, and return the start of the next second.
+        """Count received and lost frames, and return the time at which the next second starts.
 
-        Called with the first frame after a gap in the sequence numbers, and with the first frame of a second.
+        Call this with the first frame after a gap in the sequence numbers, and with the first frame of each second.
 
         Args:
             time_s: time of the frame.

@@ -45,7 +45,7 @@ class TableColumn(Snapshot):
 class LogRecord(NamedTuple):
     """One record of a log: a MAVLink message, or a row of a flight controller's own log.
 
-    A tuple, because a log has millions of records, and a `Snapshot` takes twice as long to create.
+    It is a tuple, because a log has millions of records, and a `Snapshot` takes twice as long to create.
     """
 
     unix_s: float

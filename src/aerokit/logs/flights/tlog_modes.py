@@ -57,7 +57,7 @@ class RecordedModeCommands:
             self._command_times[mode.name].append(time_s)
 
     def attribute_modes(self, speed: float) -> None:
-        """Mark the mode changes that were commanded. ``speed``: vehicle seconds per recorded second."""
+        """Mark the mode changes that were commanded. ``speed`` is the vehicle's seconds in a recorded second."""
         for times in self._command_times.values():
             times.sort()
         changes: list[ModeChange] = []

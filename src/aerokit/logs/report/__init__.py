@@ -57,10 +57,10 @@ def write_report(
     The file gets its name only when it is complete. The function blocks; it needs no event loop.
 
     Args:
-        log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
+        log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, or a ``.ulg`` of PX4.
         target: the file to write, such as ``flight.html``.
         compare_with: a second log, of any of these formats, to compare the flight with.
-        system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None: the first vehicle.
+        system_id: system id of the vehicle, if a ``.tlog`` contains several vehicles; None selects the first vehicle.
         force: replace an existing file.
         on_progress: called from time to time with the number of bytes read so far; for two logs, it starts again at 0.
 

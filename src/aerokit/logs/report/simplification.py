@@ -20,7 +20,7 @@ MAX_COORDINATE = 1e9
 class _Segment(NamedTuple):
     """A line segment from the point ``first`` to the point ``last``, which replaces the points between them.
 
-    heapq returns the smallest item first, so the square of the largest deviation is negative.
+    heapq returns the smallest item first, so the square of the largest deviation is stored with a negative sign.
     """
 
     negative_square: float

@@ -37,7 +37,7 @@ _BEFORE_FALL_S = 5.0
 
 
 class FlightStatistics(Snapshot):
-    """Statistics of the armed time, or of the whole log if the vehicle was never armed. None: unknown."""
+    """Statistics of the armed time, or of the whole log if the vehicle was never armed. None means unknown."""
 
     armed_s: float | None
     distance_m: float | None

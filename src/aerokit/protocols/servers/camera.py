@@ -73,7 +73,7 @@ def _information(camera: CameraDevice) -> m.CameraInformation:
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
-    """Return the requested images, or the last image for a periodic message (None)."""
+    """Return the images that the command requests, or the last image if ``command`` is None (periodic message)."""
     if command is None:
         return camera.captures.images[-1:]
     # REQUEST_MESSAGE for CAMERA_IMAGE_CAPTURED: param 2 is the index of the first image, or -1 for all images. Param 3

@@ -127,11 +127,11 @@ class CameraDevice:
         """Set the CAMERA_MODE. The protocol server has already checked the value."""
 
     async def set_zoom(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_ZOOM; return False if type or value is not supported."""
+        """Apply SET_CAMERA_ZOOM. Return False if ``kind`` (CAMERA_ZOOM_TYPE) or ``value`` is not supported."""
         return False
 
     async def set_focus(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_FOCUS; return False if type or value is not supported."""
+        """Apply SET_CAMERA_FOCUS. Return False if ``kind`` (SET_FOCUS_TYPE) or ``value`` is not supported."""
         return False
 
     async def set_source(self, source: int) -> bool:
@@ -142,7 +142,10 @@ class CameraDevice:
         """Start or stop video streams."""
 
     async def track(self, place: tuple[float, ...]) -> None:
-        """Track a point (x, y, radius) or a rectangle (left, top, right, bottom), or stop tracking (empty tuple)."""
+        """Track a point (x, y, radius) or a rectangle (left, top, right, bottom), or stop tracking (empty tuple).
+
+        The numbers are fractions of the image.
+        """
 
     async def format_storage(self) -> None:
         """Erase images and videos."""

@@ -105,7 +105,7 @@ class Mount(ABC):
 
 
 class TextMount(Mount):
-    """Read-only text files, such as ArduPilot's ``@SYS``. Each is reported with a size of 100,000 bytes when opened."""
+    """Read-only text files, such as ArduPilot's ``@SYS``. The reported size is always 100,000 bytes."""
 
     is_listed = True
     _REPORTED_SIZE = 100_000
@@ -177,7 +177,7 @@ class _OpenFile(FileHandle):
 class FileTree:
     """Folders and files. Leading slashes, empty parts and ``.`` in paths are ignored.
 
-    ``free_bytes`` is the remaining space; None is unlimited.
+    ``free_bytes`` is the remaining space; None means that it is unlimited.
     """
 
     def __init__(self, *, free_bytes: int | None = None) -> None:
@@ -189,7 +189,8 @@ class FileTree:
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
         """Create or replace a file, and create its folders.
 
-        A function as content is called when the content is first needed. Until then, ``size`` is reported.
+        A function as content is called when the content is first needed. Until then, the file is reported with ``size``
+        bytes. If ``size`` is None, the function is called for the size, too.
         """
         folder = self._root
         *parents, name = _parts(path)

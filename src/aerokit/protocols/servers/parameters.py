@@ -180,7 +180,7 @@ class DefinedParameterServer(ExtendedParameterServer):
     """Settings that a camera definition defines.
 
     Write-only settings are not listed. The answer to a value that the definition does not allow is VALUE_UNSUPPORTED.
-    The answer to a change of a read-only or excluded setting is FAILED.
+    The answer is FAILED for a setting that is read-only, or that the present value of another setting excludes.
     """
 
     def __init__(self, host: ServerHost, definition: CameraDefinition) -> None:

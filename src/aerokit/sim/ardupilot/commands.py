@@ -1,6 +1,6 @@
 """Commands (MAV_CMD) that all simulated ArduPilots implement, with the conditions and results of the firmware.
 
-Results are those of a vehicle without lifting rotors.
+Plane's results are those of a plane without lifting rotors, which is not a QuadPlane.
 """
 
 from __future__ import annotations

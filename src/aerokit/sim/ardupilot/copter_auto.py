@@ -126,7 +126,7 @@ class _ClimbLeg:
 
 
 class _ReturnLeg(CopterRtl):
-    """Flight back and landing, as in the mode RTL. Complete when the motors idle on the ground."""
+    """Flight back and landing, as in the mode RTL. The leg is complete when the motors idle on the ground."""
 
     @property
     def is_complete(self) -> bool:
@@ -134,7 +134,7 @@ class _ReturnLeg(CopterRtl):
 
 
 class _DescendLeg:
-    """Landing at the place where the leg begins. Complete when the motors idle on the ground."""
+    """Landing at the place where the leg begins. The leg is complete when the motors idle on the ground."""
 
     def __init__(self, copter: CopterHost) -> None:
         self._copter = copter

@@ -190,7 +190,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return _LINK_ACTIONS[value] if 0 <= value < len(_LINK_ACTIONS) else default
 
     def _action_after_loss(self, name: str, action: int, options: Sequence[_ContinueOption]) -> int:
-        """Report the loss of the link ``name``. Return the action to execute, by default ``action``."""
+        """Report the loss of the link ``name``. Return ``action``, or the action that replaces it in this situation."""
         mode = self.vehicle.mode
         if self._disarm_if_landed(name):
             return _NONE

@@ -118,7 +118,8 @@ class CopterGuided(CopterModeBase, GuidedMode):
     ) -> None:
         """Hold roll and pitch in radians and a climb rate in m/s.
 
-        ``body_rates`` in rad/s replace the angles: they change the present or the last commanded roll and pitch.
+        ``body_rates`` in rad/s replace the angles. They begin at the vehicle's roll and pitch or, if rates were already
+        commanded, continue from the commanded ones.
         """
         if body_rates is None:
             self._attitude = angles

@@ -47,7 +47,7 @@ class MissionCommand(NamedTuple):
 
 
 class SupportedCommand(NamedTuple):
-    """How a mode executes a mission command: by default, it does nothing and is complete at once."""
+    """How a mode executes a mission command. By default, the command does nothing and is complete at once."""
 
     start: Callable[[MissionItem], None] = lambda _: None
     is_done: Callable[[int, MissionItem], bool] = lambda _index, _item: True

@@ -305,7 +305,7 @@ class SmartPath:
         return path[::-1]
 
     def restore(self, way_back: Sequence[Ned]) -> None:
-        """Replace the recorded points by the part of `take_way_back` that was not flown."""
+        """Replace the recorded points by ``way_back``, the part of the path from `take_way_back` that was not flown."""
         self._points[:] = list(way_back)[::-1]
         self._cleaned_count = len(self._points)
 

@@ -98,7 +98,7 @@ class Lens:
         return FOCAL_LENGTH_MM * (1.0 + (_ZOOM_FACTOR - 1.0) * self.zoom.percent / 100.0)
 
     def set_zoom(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_ZOOM. Return False if the type or the value is not supported."""
+        """Apply SET_CAMERA_ZOOM. Return False if ``kind`` (CAMERA_ZOOM_TYPE) or ``value`` is not supported."""
         zoom_factor = value / FOCAL_LENGTH_MM
         if kind != CameraZoomType.FOCAL_LENGTH or not 1.0 <= zoom_factor <= _ZOOM_FACTOR:
             return self.zoom.adjust(kind, value)
@@ -106,7 +106,7 @@ class Lens:
         return True
 
     def set_focus(self, kind: int, value: float) -> bool:
-        """Apply SET_CAMERA_FOCUS. Return False if the type or the value is not supported."""
+        """Apply SET_CAMERA_FOCUS. Return False if ``kind`` (SET_FOCUS_TYPE) or ``value`` is not supported."""
         if kind == SetFocusType.METERS and value > 0.0:
             self.focus.set(100.0 * value / (value + _HALF_RANGE_FOCUS_M))  # A focus of 100 % is infinity.
         elif kind in _AUTO:

@@ -142,7 +142,7 @@ class SimulatedComponent:
             self.reboot()
 
     def reboot(self) -> None:
-        """Boot now, also for the first time."""
+        """Boot now. The first boot, when the vehicle is switched on, also calls this method."""
         self.vehicle.cancel_timers(self)
         self._booted_at = self.now
         self._streams.clear()

@@ -209,9 +209,9 @@ class Px4Host(SimulatedAutopilot):
         return True
 
     def can_run(self, mode: Px4Mode) -> bool:
-        """Return True if everything the mode needs is available.
+        """Return True if everything that the mode needs is available.
 
-        Depending on the mode, these are stick input, a valid mission, set-points, and a position estimate.
+        A mode may need stick input, a valid mission, set-points or a position estimate.
         """
         traits = modes.MODES.get(mode)
         if traits is None or self.arming.is_terminated:
