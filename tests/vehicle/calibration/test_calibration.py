@@ -463,13 +463,14 @@ async def test_late_result_of_px4_is_received_after_a_long_step() -> None:
                 send_text(*arguments)
 
         async for step in vehicle.calibrate.gyroscope():
+            result = step.result
             calibrating += vehicle.system_status.latest == MavState.CALIBRATING
             if calibrating == 2 and not texts:
                 px4.send_text = lambda *arguments: texts.append(arguments)
                 await vehicle.system_status.wait_until(lambda status: status != MavState.CALIBRATING)
                 await anyio.sleep(2.0)
                 asyncio.get_running_loop().call_later(0.5, send_all)
-    assert step.result is not None
+    assert result is not None
 
 
 async def test_silent_vehicle_raises_heartbeat_timeout() -> None:
