@@ -130,7 +130,7 @@ async def _download(
     on_ended: Callable[[], None],
 ) -> None:
     try:
-        # The callbacks are weak, so that the program's vehicle can be freed.
+        # The callbacks hold only weak references to the classic `Vehicle`, so this task does not keep it in memory.
         on_success(await vehicle.parameters.download(method=await _download_method(vehicle)))
     except ConnectionClosed:
         return

@@ -1,4 +1,4 @@
-"""Conversions of items: to messages, to packed plans, to the item numbers of the vehicle; and back."""
+"""Conversions of items: to messages, to ArduPilot's plan files, to the item numbers of the vehicle; and back."""
 
 from __future__ import annotations
 
@@ -165,21 +165,21 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
         yield item
 
 
-# ----------------------------------------------------------------------------------- packed plans
+# ---------------------------------------------------------------------------- ArduPilot's plan files
 
 # ArduPilot's ``@MISSION/mission.dat``, ``fence.dat`` and ``rally.dat``: a header of ten bytes (magic number,
 # MAV_MISSION_TYPE, options, first index, number of items; 16 bits each, little endian), then 38 bytes for each item: a
 # MISSION_ITEM_INT, not truncated. Missions have home as item 0.
 MAGIC = 0x763D
 HEADER = struct.Struct("<5H")
-NO_CLEAR = 1  # option of a packed plan that replaces only the items in the file, and keeps all others
+NO_CLEAR = 1  # option of a plan file that replaces only its own items, and keeps all others
 PACKED_PATHS = {0: "@MISSION/mission.dat", 1: "@MISSION/fence.dat", 2: "@MISSION/rally.dat"}
 
 _ITEM_LENGTH = messages.MissionItemInt.LENGTH
 
 
 class PlanHeader(NamedTuple):
-    """Header of a packed plan."""
+    """Header of one of ArduPilot's plan files."""
 
     mission_type: int
     options: int
@@ -200,7 +200,7 @@ def pack_items(
     target_system: int = 0,
     target_component: int = 0,
 ) -> bytes:
-    """Encode items as a packed plan. Indices are those of the vehicle, so item 0 of a mission is home.
+    """Encode items as one of ArduPilot's plan files. Indices are those of the vehicle, so item 0 of a mission is home.
 
     By default, the plan replaces all items. When the written file is closed, ArduPilot deletes the old items and stores
     the new items, up to the first item that it refuses.
@@ -225,27 +225,27 @@ def pack_items(
 
 
 def read_header(data: bytes) -> PlanHeader:
-    """Decode the header of a packed plan. Raises RemoteProtocolError for other data."""
+    """Decode the header of a plan file. Raises RemoteProtocolError for other data."""
     if len(data) < HEADER.size:
-        raise RemoteProtocolError(f"packed plan: expected a header of {HEADER.size} bytes, received {len(data)} bytes")
+        raise RemoteProtocolError(f"plan file: expected a header of {HEADER.size} bytes, received {len(data)} bytes")
     magic, *numbers = HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise RemoteProtocolError(f"packed plan: expected the magic number 0x{MAGIC:04X}, found 0x{magic:04X}")
+        raise RemoteProtocolError(f"plan file: expected the magic number 0x{MAGIC:04X}, found 0x{magic:04X}")
     return PlanHeader(*numbers)
 
 
 def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
-    """Decode all items of a packed plan. In a mission of ArduPilot, item 0 is home.
+    """Decode all items of one of ArduPilot's plan files. Item 0 of a mission is home.
 
     The header says which item is the first (``first_index``). Raises RemoteProtocolError if the data is not a complete
-    packed plan of this type.
+    plan file of this type.
     """
     header = read_header(data)
     if mission_type is not None and header.mission_type != mission_type:
-        raise RemoteProtocolError(f"packed plan: expected MAV_MISSION_TYPE {mission_type}, found {header.mission_type}")
+        raise RemoteProtocolError(f"plan file: expected MAV_MISSION_TYPE {mission_type}, found {header.mission_type}")
     if len(data) != header.length:
         raise RemoteProtocolError(
-            f"packed plan: expected {header.length} bytes for {header.item_count} items, received {len(data)} bytes"
+            f"plan file: expected {header.length} bytes for {header.item_count} items, received {len(data)} bytes"
         )
     starts = range(HEADER.size, header.length, _ITEM_LENGTH)
     return tuple(from_wire(messages.MissionItemInt.decode(data[start : start + _ITEM_LENGTH])) for start in starts)

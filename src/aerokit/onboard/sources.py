@@ -161,7 +161,7 @@ class ComponentSources:
         check_range("right_deg", right_deg, -90, 90)
         check_range("down_deg", down_deg, -90, 90)
         if not 0 <= distance_m < math.inf:
-            raise InvalidArgument(f"distance_m = {distance_m} is not allowed: it must be 0 or more")
+            raise InvalidArgument(f"distance_m = {distance_m} is not allowed: it must be 0 or more, and finite")
         self._send(
             m.LandingTarget(
                 time_usec=self._time_us(),

@@ -91,8 +91,8 @@ class Renamed(Snapshot):
         cannot have, such as NaN or a fraction of a bit mask, is returned unchanged.
         """
         converted = self._convert(value, from_name=self.requested)
-        is_scaled = self._has_other_units and self.rename.divisor != 1 and math.isfinite(converted)
-        return round(converted) if is_scaled and type is not None and type.is_integer else converted
+        is_integer = type is not None and type.is_integer
+        return round(converted) if is_integer and self._is_scaled and math.isfinite(converted) else converted
 
     def to_requested(self, value: float) -> int | float:
         """Convert a value of the vehicle to the program's units."""
@@ -105,7 +105,7 @@ class Renamed(Snapshot):
         """
         default = None if parameter.default is None else self.to_requested(parameter.default)
         converted = parameter.replace(name=self.requested, value=self.to_requested(parameter.value), default=default)
-        if self.rename.divisor == 1 or not self._has_other_units:
+        if not self._is_scaled:
             return converted
         default = None if default is None else to_float32(default)
         return converted.replace(value=to_float32(converted.value), default=default, type=ParameterType.REAL32)
@@ -117,7 +117,7 @@ class Renamed(Snapshot):
         is_old_firmware = self.name in self.rename.old_names
         if self._has_other_units and self.rename.is_inverted:
             text += "; the bits are inverted, and the value was converted"
-        elif self._has_other_units and self.rename.divisor != 1:
+        elif self._is_scaled:
             old, new = (self.name, self.requested) if is_old_firmware else (self.requested, self.name)
             text += f"; values were converted ({old} = {self.rename.divisor} × {new})"
         if is_old_firmware:
@@ -129,6 +129,10 @@ class Renamed(Snapshot):
             return value
         is_old = from_name in self.rename.old_names
         return self.rename.to_new(value) if is_old else self.rename.to_old(value)
+
+    @property
+    def _is_scaled(self) -> bool:
+        return self._has_other_units and self.rename.divisor != 1
 
     @property
     def _has_other_units(self) -> bool:

@@ -123,7 +123,7 @@ class FaultInjector:
 
     def _schedule(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):
-            raise InvalidArgument(f"after_s = {after_s!r} is not allowed: it must be 0 or more")
+            raise InvalidArgument(f"after_s = {after_s!r} is not allowed: it must be 0 or more, and finite")
         self._with_scheduler(lambda scheduler: scheduler.do(action, after_s=after_s))
 
 

@@ -142,7 +142,9 @@ class CopterHost(ArduPilotVehicle):
         self.motion.seek_velocity(0.0, 0.0, 0.0)
 
     def descend(self) -> None:
-        """Descend with the speeds of the mode LAND. On the ground, let the motors idle."""
+        """Descend with the speeds of the mode LAND, over the landing target if there is one. On the ground, let the
+        motors idle.
+        """
         self.motors.spool_up_requested = not self.is_landed
         if self.is_landed:
             return

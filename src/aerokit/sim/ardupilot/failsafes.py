@@ -176,7 +176,7 @@ class ArduPilotArming(Generic[HostT]):
         self._reported_at = -math.inf
         self._passed_common = False  # result of the common checks one second ago
         self._has_new_failure = False  # True until the failure is reported
-        self._was_always_armed = False
+        self._arming_was_not_required = False  # value at the last update
 
     def start(self) -> None:
         self._reported_at = self.vehicle.now
@@ -286,9 +286,9 @@ class ArduPilotArming(Generic[HostT]):
 
     def _apply_requirement(self) -> None:
         vehicle, is_always_armed = self.vehicle, not self.needs_arming
-        if is_always_armed == self._was_always_armed:
+        if is_always_armed == self._arming_was_not_required:
             return
-        self._was_always_armed = is_always_armed
+        self._arming_was_not_required = is_always_armed
         if is_always_armed != vehicle.motors.is_armed:
             vehicle.motors.set_armed(armed=is_always_armed)
             vehicle.set_ticking(True)

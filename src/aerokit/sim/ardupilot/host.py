@@ -275,7 +275,7 @@ ABSOLUTE_FRAMES = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class ArduPilotHost(SimulatedAutopilot):
-    """A simulated ArduPilot as its parts see it. `ArduPilotVehicle` implements this interface."""
+    """Interface of a simulated ArduPilot for its modes, failsafes and other parts. `ArduPilotVehicle` implements it."""
 
     KIND: ClassVar[Kind]
     """The kind of firmware, which selects the parameter table."""

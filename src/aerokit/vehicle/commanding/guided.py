@@ -45,7 +45,7 @@ SetpointT = TypeVar("SetpointT")
 # stream's rate, because a message may be lost, and after that only every REPEAT_INTERVAL_S seconds.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
-# Set-points that the autopilot executes with limited acceleration, so that only an impact stops the vehicle suddenly.
+# The autopilot limits the acceleration for these set-points. While it follows them, a sudden stop means an impact.
 BRAKED_BY_AUTOPILOT = (
     VelocitySetpoint,
     BodyVelocitySetpoint,

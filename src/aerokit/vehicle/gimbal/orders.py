@@ -191,7 +191,7 @@ class GimbalOrders:
         return False
 
     def _send_unanswered(self, order: Order, message: Message) -> None:
-        """Send a message that has no ack. Raises OperationRejected after a newer order."""
+        """Send a message that has no ack. Raises OperationRejected if a newer order was given after ``order``."""
         with self.context.arbiter.auxiliary_order(order):
             self.session.send(message)
 
