@@ -381,6 +381,21 @@ async def test_px4_upload_after_lost_cancellation_of_older_upload(older_count: i
         assert now() - started_at < 4.0
 
 
+async def test_px4_lost_cancellation_before_download_blocks_no_upload() -> None:
+    async with open_px4(latency_s=0.02) as flight:
+        handlers = flight.px4.handlers
+        on_item, on_ack = handlers[m.MissionItemInt.ID], handlers[m.MissionAck.ID]
+        handlers[m.MissionItemInt.ID] = handlers[m.MissionAck.ID] = lambda *_: None
+        with anyio.move_on_after(0.5):
+            await flight.vehicle.mission.upload(long_mission(7), method="items")
+        await anyio.sleep(0.1)  # The cancellation arrives, and is lost.
+        assert flight.px4.missions.transfer_is_open
+        handlers[m.MissionItemInt.ID], handlers[m.MissionAck.ID] = on_item, on_ack
+        assert await flight.vehicle.mission.download(method="items") == Mission()
+        await flight.vehicle.mission.upload(long_mission(7), method="items")
+        assert holds(flight, long_mission(7))
+
+
 async def test_px4_silent_after_early_acceptance_may_have_first_items() -> None:
     async with open_px4(latency_s=0.02) as flight:
         await flight.vehicle.mission.upload(long_mission(7))
