@@ -412,6 +412,26 @@ async def test_px4_silent_after_early_acceptance_may_have_first_items() -> None:
         assert len(held_by(flight)) == 3
 
 
+async def test_px4_silent_after_abandoned_upload_may_have_first_items() -> None:
+    """PX4 takes the first items for those of the abandoned upload. Its acceptance is lost, like both cancellations."""
+    async with open_px4(latency_s=0.02) as flight:
+        handlers, upload = flight.px4.handlers, flight.vehicle.mission.upload
+        on_item = handlers[m.MissionItemInt.ID]
+        handlers[m.MissionItemInt.ID] = handlers[m.MissionAck.ID] = lambda *_: None
+        with anyio.move_on_after(0.5):
+            await upload(long_mission(3), method="items")
+
+        def lose_later_items(message: m.MissionItemInt, channel: Any) -> None:
+            if message.seq < 3:
+                on_item(message, channel)
+
+        handlers[m.MissionItemInt.ID] = lose_later_items
+        flight.px4.faults.lose(m.MissionAck, times=100)
+        with pytest.raises(MissionTimeout, match="may have accepted the first items as the whole plan"):
+            await upload(changed(long_mission(20), 1), method="items")
+        assert len(held_by(flight)) == 3
+
+
 async def test_upload_that_cannot_be_read_back_was_confirmed() -> None:
     async with open_px4(latency_s=0.02) as flight:
         flight.px4.handlers[m.MissionRequestList.ID] = lambda *_: None

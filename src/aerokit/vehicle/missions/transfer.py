@@ -56,6 +56,7 @@ class PlanChannel:
         self._path = PACKED_PATHS[mission_type]
         self._has_changed = False  # True if the vehicle may have received some of our items
         self._may_have_read_file = False  # True if the vehicle may have evaluated a file of this call
+        self._may_continue_older_upload = False  # True if the vehicle may not know that an older upload has ended
         self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
@@ -168,6 +169,7 @@ class PlanChannel:
         session = self._context.session
         other_boots = session.watch.other_boots
         if started_at - self._context.upload_abandoned_at < BUSY_TIMEOUT_S and not session.is_held_back:
+            self._may_continue_older_upload = True
             # If PX4 receives MISSION_REQUEST_LIST during an upload, it may leave the upload in such a way that it
             # refuses all uploads until it reboots (mavlink_mission.cpp, handle_mission_request_list). The cancellation
             # of the upload may have been lost.
@@ -226,7 +228,10 @@ class PlanChannel:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_silent and self._may_have_read_file:
             return f"; {UNKNOWN_CONTENT}"
-        if exchange.was_accepted_early and not overwrites_in_place:
+        # PX4 may take the first items for those of an older, shorter upload, and its acceptance may have been lost.
+        is_end_unknown = is_silent or result == MavMissionResult.ERROR
+        may_be_cut = exchange.was_started and is_end_unknown and self._may_continue_older_upload
+        if (exchange.was_accepted_early or may_be_cut) and not overwrites_in_place:
             return "; the vehicle may have accepted the first items as the whole plan: call download()"
         if is_partly_overwritten and refused_item:
             # After the upload of a file there are no later items, because ArduPilot has cleared its plan first.
