@@ -90,8 +90,45 @@ def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked
     assert [event.done for event in reported] == [0, 1, kept]
     for seq in range(3):
         answer(to_wire(held[seq], seq, target_system=GCS[0], target_component=GCS[1], mission_type=0), 105.0)
+    if opaque_id:  # The id is requested again.
+        answer(m.MissionCount(*GCS, 3, 0, opaque_id), 106.0)
     assert list(exchange.result().items) == held
     assert exchange.result().opaque_id == opaque_id
+
+
+def test_mission_download_of_replaced_plan_has_only_new_items() -> None:
+    """Another station replaces PX4's plan over another link. From then on, PX4 sends the items of the new plan."""
+    old, new = HELD[:3], HELD[10:13]
+    exchange = download(window=1, round_trip=RoundTrip(0.1))
+
+    def answer(items_on_vehicle: list[MissionItem], opaque_id: int, now: float) -> None:
+        for message in exchange.take_outbox():
+            if isinstance(message, m.MissionRequestList):
+                exchange.receive(m.MissionCount(*GCS, 3, 0, opaque_id), now)
+            elif isinstance(message, m.MissionRequestInt):
+                item = to_wire(
+                    items_on_vehicle[message.seq], message.seq, target_system=GCS[0], target_component=GCS[1]
+                )
+                exchange.receive(item, now)
+
+    exchange.start(0.0)
+    for number in range(2):  # The count and the first item of the old plan.
+        answer(old, 7, 0.1 + 0.1 * number)
+    for number in range(20):
+        answer(new, 8, 0.3 + 0.1 * number)
+    assert list(exchange.result().items) == new
+    assert exchange.result().opaque_id == 8
+
+
+def test_mission_download_timeout_before_id_was_received_again() -> None:
+    exchange = download(round_trip=RoundTrip(0.1), idle_timeout_s=2.0)
+    exchange.start(0.0)
+    exchange.receive(m.MissionCount(*GCS, 1, 0, 7), 0.1)
+    exchange.receive(to_wire(HELD[0], 0, target_system=GCS[0], target_component=GCS[1]), 0.2)
+    exchange.expire(2.3)
+    with pytest.raises(MissionTimeout, match="whether another station has replaced the plan") as caught:
+        exchange.result()
+    assert caught.value.missing == ()
 
 
 @given(

@@ -47,6 +47,10 @@ class DownloadResult(Snapshot):
 class MissionDownload(MissionExchange[DownloadResult]):
     """Downloads a plan: sends MISSION_REQUEST_LIST, then a request for every item, then MISSION_ACK.
 
+    If the vehicle reports an id of the plan, MISSION_REQUEST_LIST is sent again before MISSION_ACK. Another id means
+    that another station has replaced the plan meanwhile, so that the items are of two plans. The download then starts
+    again.
+
     Args:
         window: the number of requests in flight. It must be 1 for PX4, which answers a request out of sequence with
             ERROR and aborts.
@@ -84,6 +88,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._busy_until: float | None = None
         self._restarts = 0
         self._has_error = False  # True if the vehicle has sent ERROR since the last answer to a request
+        self._is_id_requested_again = False  # True if all items had arrived when the list was last requested
 
     def _begin(self, now: float) -> None:
         self._received_at = now
@@ -132,11 +137,11 @@ class MissionDownload(MissionExchange[DownloadResult]):
                 self.round_trip.add_sample(now - self._list_requested_at)
             # After a restart, the items received before stay valid only if the plan has the same id.
             if not opaque_id or opaque_id != self._opaque_id:
-                self._items.clear()
+                self._discard_items()
         elif message.count == self._count and opaque_id == self._opaque_id:
             return  # PX4 repeats MISSION_COUNT until the first item is requested
         else:  # The plan has changed since the download began.
-            self._items.clear()
+            self._discard_items()
             self._discard_requests()
         self._count = message.count
         self._opaque_id = opaque_id
@@ -201,6 +206,10 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._received_at = now
         self._request_list(now)
 
+    def _discard_items(self) -> None:
+        self._items.clear()
+        self._is_id_requested_again = False
+
     def _discard_requests(self) -> None:
         self._requested_at.clear()
         self._request_counts.clear()
@@ -209,8 +218,13 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # -------------------------------------------------------------------------------- requests
 
     def _proceed(self, now: float) -> None:
-        if len(self._items) >= len(self._indices):
-            self._acknowledge_and_finish()
+        if self._has_all_items:
+            # While PX4 sends items over one link, it accepts another plan over another link, and then sends the items
+            # of the new plan (mavlink_mission.cpp, send_mission_item).
+            if self._opaque_id and self._items and not self._is_id_requested_again:
+                self._restart(now)
+            else:
+                self._acknowledge_and_finish()
             return
         while self._next_position < len(self._indices) and len(self._requested_at) < self._window:
             seq = self._indices[self._next_position]
@@ -229,7 +243,12 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _request_list(self, now: float) -> None:
         self._outbox.append(MissionRequestList(self.target_system, self.target_component, self.mission_type))
         self._list_requested_at = now
+        self._is_id_requested_again = bool(self._items) and self._has_all_items
         self._wait(now)
+
+    @property
+    def _has_all_items(self) -> bool:
+        return len(self._items) >= len(self._indices)
 
     def _due_at(self, seq: int) -> float:
         return self._requested_at[seq] + self._timeout_s(self._request_counts[seq])
@@ -251,8 +270,12 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._outbox += self.cancellation()
         # The caller's item 0 is the first one after home.
         missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)
-        has_count = bool(self._indices)  # Not `_count`, which a restart resets to None.
-        details = f"missing: {format_ranges(missing) or 'home'}" if has_count else "no MISSION_COUNT was received"
+        if not self._indices:  # Not `_count`, which a restart resets to None.
+            details = "no MISSION_COUNT was received"
+        elif self._has_all_items:
+            details = "all items were received, but not whether another station has replaced the plan meanwhile"
+        else:
+            details = f"missing: {format_ranges(missing) or 'home'}"
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the download:"

@@ -381,6 +381,21 @@ async def test_px4_upload_after_lost_cancellation_of_older_upload(older_count: i
         assert now() - started_at < 4.0
 
 
+async def test_px4_lost_cancellation_before_download_blocks_no_upload() -> None:
+    async with open_px4(latency_s=0.02) as flight:
+        handlers = flight.px4.handlers
+        on_item, on_ack = handlers[m.MissionItemInt.ID], handlers[m.MissionAck.ID]
+        handlers[m.MissionItemInt.ID] = handlers[m.MissionAck.ID] = lambda *_: None
+        with anyio.move_on_after(0.5):
+            await flight.vehicle.mission.upload(long_mission(7), method="items")
+        await anyio.sleep(0.1)  # The cancellation arrives, and is lost.
+        assert flight.px4.missions.transfer_is_open
+        handlers[m.MissionItemInt.ID], handlers[m.MissionAck.ID] = on_item, on_ack
+        assert await flight.vehicle.mission.download(method="items") == Mission()
+        await flight.vehicle.mission.upload(long_mission(7), method="items")
+        assert holds(flight, long_mission(7))
+
+
 async def test_px4_silent_after_early_acceptance_may_have_first_items() -> None:
     async with open_px4(latency_s=0.02) as flight:
         await flight.vehicle.mission.upload(long_mission(7))
@@ -394,6 +409,26 @@ async def test_px4_silent_after_early_acceptance_may_have_first_items() -> None:
         flight.px4.handlers[m.MissionItemInt.ID] = lose_later_items
         with pytest.raises(MissionTimeout, match="may have accepted the first items as the whole plan"):
             await flight.vehicle.mission.upload(changed(long_mission(20), 1))
+        assert len(held_by(flight)) == 3
+
+
+async def test_px4_silent_after_abandoned_upload_may_have_first_items() -> None:
+    """PX4 takes the first items for those of the abandoned upload. Its acceptance is lost, like both cancellations."""
+    async with open_px4(latency_s=0.02) as flight:
+        handlers, upload = flight.px4.handlers, flight.vehicle.mission.upload
+        on_item = handlers[m.MissionItemInt.ID]
+        handlers[m.MissionItemInt.ID] = handlers[m.MissionAck.ID] = lambda *_: None
+        with anyio.move_on_after(0.5):
+            await upload(long_mission(3), method="items")
+
+        def lose_later_items(message: m.MissionItemInt, channel: Any) -> None:
+            if message.seq < 3:
+                on_item(message, channel)
+
+        handlers[m.MissionItemInt.ID] = lose_later_items
+        flight.px4.faults.lose(m.MissionAck, times=100)
+        with pytest.raises(MissionTimeout, match="may have accepted the first items as the whole plan"):
+            await upload(changed(long_mission(20), 1), method="items")
         assert len(held_by(flight)) == 3
 
 

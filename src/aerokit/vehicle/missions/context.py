@@ -108,6 +108,8 @@ class PlanContext:
         self.transfers: Transfers = vehicle_context.session.transfers
         self.autopilot: Autopilot = vehicle_context.session.autopilot
         self.lock: asyncio.Lock = asyncio.Lock()
+        # Time at which an upload was last cancelled or timed out. The vehicle may not have received its cancellation.
+        self.upload_abandoned_at: float = -math.inf
         # The index is the MAV_MISSION_TYPE.
         self.caches: tuple[PlanCache, PlanCache, PlanCache] = (PlanCache(), PlanCache(), PlanCache())
         self._current: Frame | None = None  # the last MISSION_CURRENT, decoded when it is needed

@@ -21,7 +21,7 @@ from aerokit.missions.compare import ItemStorage, changed_items, item_difference
 from aerokit.missions.wire import PACKED_PATHS, pack_items, shift_jumps, unpack_items, with_home
 from aerokit.protocols.mission_download import DownloadResult, MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload, UploadResult
-from aerokit.protocols.missions import MissionClear, mission_checksum
+from aerokit.protocols.missions import BUSY_TIMEOUT_S, MissionClear, mission_checksum
 from aerokit.vehicle.commanding.arming import BOOT_STATES
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ class PlanChannel:
         self._path = PACKED_PATHS[mission_type]
         self._has_changed = False  # True if the vehicle may have received some of our items
         self._may_have_read_file = False  # True if the vehicle may have evaluated a file of this call
+        self._may_continue_older_upload = False  # True if the vehicle may not know that an older upload has ended
         self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
@@ -169,6 +170,12 @@ class PlanChannel:
         started_at = connection.now()
         session = self._context.session
         other_boots = session.watch.other_boots
+        if started_at - self._context.upload_abandoned_at < BUSY_TIMEOUT_S and not session.is_held_back:
+            self._may_continue_older_upload = True
+            # If PX4 receives MISSION_REQUEST_LIST during an upload, it may leave the upload in such a way that it
+            # refuses all uploads until it reboots (mavlink_mission.cpp, handle_mission_request_list). The cancellation
+            # of the upload may have been lost.
+            self._send_cancellation(exchange)
         try:
             return await self._context.transfers.run(exchange)
         except MissionRejected as error:
@@ -180,6 +187,7 @@ class PlanChannel:
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
             self._record_changes(exchange)
+            self._record_abandoned_upload(exchange)
             # Change only the text, so that the error keeps its attribute `missing`.
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
             raise
@@ -187,9 +195,19 @@ class PlanChannel:
             # If this call was cancelled, the transfer is also cancelled on the vehicle. A reopened link may lead to
             # another vehicle, which may have a transfer with another station.
             is_same_boot = session.watch.other_boots == other_boots and not session.is_held_back
-            if not exchange.done and connection.is_open and is_same_boot:
-                for cancellation in exchange.cancellation():
-                    connection.send(cancellation)
+            if not exchange.done and is_same_boot:
+                self._record_abandoned_upload(exchange)
+                self._send_cancellation(exchange)
+
+    def _send_cancellation(self, exchange: MissionExchange[Any]) -> None:
+        connection = self._context.transfers.connection
+        if connection.is_open:
+            for cancellation in exchange.cancellation():
+                connection.send(cancellation)
+
+    def _record_abandoned_upload(self, exchange: MissionExchange[Any]) -> None:
+        if isinstance(exchange, MissionUpload):
+            self._context.upload_abandoned_at = self._context.now()
 
     def _record_changes(self, exchange: MissionExchange[Any]) -> None:
         if isinstance(exchange, MissionUpload):
@@ -212,7 +230,10 @@ class PlanChannel:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_silent and self._may_have_read_file:
             return f"; {UNKNOWN_CONTENT}"
-        if exchange.was_accepted_early and not overwrites_in_place:
+        # PX4 may take the first items for those of an older, shorter upload, and its acceptance may have been lost.
+        is_end_unknown = is_silent or result == MavMissionResult.ERROR
+        may_be_cut = exchange.was_started and is_end_unknown and self._may_continue_older_upload
+        if (exchange.was_accepted_early or may_be_cut) and not overwrites_in_place:
             return "; the vehicle may have accepted the first items as the whole plan: call download()"
         if is_partly_overwritten and refused_item:
             # After the upload of a file there are no later items, because ArduPilot has cleared its plan first.
