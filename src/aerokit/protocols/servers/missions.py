@@ -116,6 +116,7 @@ class MissionServer:
         self._may_set_current = on_set_current  # returns False to refuse a MISSION_SET_CURRENT
         self._capacity = capacity
         self._uploads: dict[int, ListUpload] = {}
+        self._last_ended: tuple[ListUpload, m.MissionAck] | None = None  # the upload that ended last, and the answer
         self._clearing: m.MissionClearAll | None = None
         """MISSION_CLEAR_ALL on which ``validate`` has not decided yet."""
         on = host.on
@@ -136,7 +137,7 @@ class MissionServer:
     def reset(self) -> None:
         """Drop running transfers, as a reboot does. The stored items are kept."""
         self._uploads.clear()
-        self._clearing = None
+        self._clearing = self._last_ended = None
 
     def opaque_id(self, mission_type: int) -> int:
         """Return the opaque id of a list, a checksum of its items. It is 0 for an empty list."""
@@ -263,7 +264,9 @@ class MissionServer:
     def _end(self, upload: ListUpload, result: int) -> None:
         self._drop(upload)
         opaque_id = self.opaque_id(upload.mission_type) if result == _Result.ACCEPTED else 0
-        self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
+        answer = m.MissionAck(*upload.client, result, upload.mission_type, opaque_id=opaque_id)
+        self._last_ended = upload, answer
+        self._host.send(answer, upload.channel)
 
     def _request_item(self, upload: ListUpload) -> None:
         upload.requested_at = self._host.now
@@ -313,7 +316,14 @@ class MissionServer:
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         """Called for an unexpected item."""
-        # Nothing is sent, because an upload requests its expected item again anyway.
+        # An upload requests its expected item again anyway, so only a repeated last item is answered: like PX4
+        # (mavlink_mission.cpp, handle_mission_item_both), because its client has missed the answer.
+        if self._last_ended is None or self.transfer_is_open:
+            return
+        upload, answer = self._last_ended
+        is_last_item = (message.mission_type, message.seq) == (upload.mission_type, upload.end - 1)
+        if is_last_item and sender_of(message) == upload.client:
+            self._host.send(answer, upload.channel)
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
         try:
