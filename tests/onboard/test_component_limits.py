@@ -169,6 +169,24 @@ async def test_repeated_last_item_of_upload_is_answered_again(result: int) -> No
     assert [(ack.target_system, ack.type) for ack in acks] == [(255, result)] * 2
 
 
+async def test_download_during_upload_of_other_client_gets_one_plan() -> None:
+    def items(z: float) -> list[MissionItem]:
+        return [MissionItem(MavCmd.NAV_WAYPOINT, 6, x=1, y=1, z=z) for _ in range(2)]
+
+    async with payload_and_station() as (payload, station):
+        payload.missions.replace(items(10.0))
+        await station.ask(m.MissionRequestList(*station.target), m.MissionCount)
+        heights = []
+        for seq in range(2):
+            item = await station.ask(m.MissionRequestInt(*station.target, seq), m.MissionItemInt)
+            heights.append(item.z)
+            payload.missions.replace(items(20.0))
+        station.connection.send(m.MissionAck(*station.target, 0))
+        await asyncio.sleep(0.1)
+        after = await station.ask(m.MissionRequestInt(*station.target, 1), m.MissionItemInt)
+    assert (heights, after.z) == ([10.0, 10.0], 20.0)
+
+
 async def test_clear_that_is_judged_occupies_the_server() -> None:
     async with payload_and_station() as (payload, station):
         judged: list[tuple[str, int]] = []
