@@ -170,6 +170,60 @@ async def test_repeated_command_with_nan_is_executed_once(duration_s: float) -> 
     assert MavResult.TEMPORARILY_REJECTED not in [ack.result for ack in acks]
 
 
+async def test_command_repeated_for_long_is_executed_once() -> None:
+    """Its answers are lost, and a repetition arrives more than five seconds after the end."""
+    started = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            nonlocal started
+            started += 1
+
+        results = []
+        for confirmation in range(4):
+            results.append((await station.command(MavCmd.USER_1, 1, confirmation=confirmation)).result)
+            await asyncio.sleep(3.0)
+    assert started == 1
+    assert results == [MavResult.ACCEPTED] * 4
+
+
+@pytest.mark.parametrize("duration_s", [0.0, 0.5])
+async def test_command_copied_by_link_is_executed_and_answered_once(duration_s: float) -> None:
+    started = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            nonlocal started
+            started += 1
+            await asyncio.sleep(duration_s)
+
+        frame = FrameEncoder(200, 190).encode(station.command_long(MavCmd.USER_1, 1))
+        with station.collecting(m.CommandAck) as acks:
+            for _ in range(3):
+                station.connection.write_raw(frame)
+                await asyncio.sleep(0.3)
+            await asyncio.sleep(2.0)
+    assert started == 1
+    assert [ack.result for ack in acks if ack.result != MavResult.IN_PROGRESS] == [MavResult.ACCEPTED]
+
+
+async def test_equal_commands_of_sender_with_constant_sequence_are_executed() -> None:
+    started = 0
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            nonlocal started
+            started += 1
+
+        for message in (m.Heartbeat(6, 8, 0, 0, 4, 3), *(station.command_long(MavCmd.USER_1, 1),) * 2):
+            station.connection.write_raw(FrameEncoder(200, 190).encode(message))
+            await asyncio.sleep(0.3)
+    assert started == 2
+
+
 async def test_repetition_after_command_of_other_sender_is_not_executed() -> None:
     senders: list[tuple[int, int]] = []
     async with payload_and_station() as (payload, station):

@@ -13,6 +13,7 @@ import anyio
 import pytest
 from onboard_peers import autopilot_and_client, device_and_client, payload_and_station
 
+import aerokit
 from aerokit._internal.files import write_atomically
 from aerokit.errors import AerokitError, FileError, InvalidArgument
 from aerokit.mavlink import messages as m
@@ -63,6 +64,24 @@ async def test_parameters_of_a_companion_are_downloaded_at_once(has_version: boo
         assert [c.param1 for c in asked if c.target_component == 191] == [m.AutopilotVersion.ID]
         for function in detach:
             function()
+
+
+@pytest.mark.parametrize("bytewise", [False, True])
+@pytest.mark.parametrize("is_announced", [False, True])
+async def test_client_encodes_first_integer_as_component_expects(bytewise: bool, is_announced: bool) -> None:
+    """Until the capabilities are known, the client does not know how the component encodes integers."""
+    async with autopilot_and_client() as (node, vehicle):
+        device = aerokit.component(connection=node.connection, component_id=191, bytewise=bytewise)
+        async with device as component:
+            component.parameters.add("SPOOL", 7)
+            await anyio.sleep(2)
+            parameters = vehicle.component(191).parameters
+            if is_announced:
+                component.parameters.set("SPOOL", 8)
+                await anyio.sleep(0.1)
+            result = await parameters.set("SPOOL", -5)
+            assert component.parameters["SPOOL"] == -5
+    assert (result.before, result.outcome) == (8 if is_announced else 7, "set")
 
 
 async def test_parameter_out_of_range_is_refused() -> None:

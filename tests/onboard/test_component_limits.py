@@ -54,6 +54,20 @@ async def test_streams_beyond_sixty_four_are_rejected() -> None:
     assert results.count(MavResult.TEMPORARILY_REJECTED) == 2
 
 
+async def test_changed_intervals_leave_no_timers() -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.message(m.RawRpm)
+        def rpm() -> m.RawRpm:
+            return m.RawRpm(0, 1.0)
+
+        before = len(payload.connection.deadlines._deadlines)
+        for number in range(300):
+            await station.command(MavCmd.SET_MESSAGE_INTERVAL, m.RawRpm.ID, 2e9 + 1000 * number)
+        await asyncio.sleep(20.0)
+        assert len(payload.connection.deadlines._deadlines) <= before + 1
+
+
 async def test_fifth_file_of_a_client_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1")
     answers = []
@@ -137,6 +151,40 @@ async def test_second_upload_is_denied_and_silent_one_is_cancelled() -> None:
     assert acks == [MavMissionResult.DENIED, MavMissionResult.OPERATION_CANCELLED]
     assert len(received) - len(acks) == 9
     assert payload.missions.items() == ()
+
+
+@pytest.mark.parametrize("result", [MavMissionResult.ACCEPTED, MavMissionResult.INVALID])
+async def test_repeated_last_item_of_upload_is_answered_again(result: int) -> None:
+    """The first answer was lost."""
+    async with payload_and_station() as (payload, station):
+        payload.missions.on_upload(lambda kind, items: result)
+        await station.ask(m.MissionCount(*station.target, 1), m.MissionRequestInt)
+        item = m.MissionItemInt(*station.target, 0, 6, 16, 0, 1, 0, 0, 0, 0, 1, 1, 1)
+        with station.collecting(m.MissionAck) as acks:
+            station.connection.send(item)
+            await asyncio.sleep(2.0)
+            station.connection.send(item)
+            station.connection.send_as(FrameEncoder(200, 1), item)  # not its upload
+            await asyncio.sleep(2.0)
+    assert [(ack.target_system, ack.type) for ack in acks] == [(255, result)] * 2
+
+
+async def test_download_during_upload_of_other_client_gets_one_plan() -> None:
+    def items(z: float) -> list[MissionItem]:
+        return [MissionItem(MavCmd.NAV_WAYPOINT, 6, x=1, y=1, z=z) for _ in range(2)]
+
+    async with payload_and_station() as (payload, station):
+        payload.missions.replace(items(10.0))
+        await station.ask(m.MissionRequestList(*station.target), m.MissionCount)
+        heights = []
+        for seq in range(2):
+            item = await station.ask(m.MissionRequestInt(*station.target, seq), m.MissionItemInt)
+            heights.append(item.z)
+            payload.missions.replace(items(20.0))
+        station.connection.send(m.MissionAck(*station.target, 0))
+        await asyncio.sleep(0.1)
+        after = await station.ask(m.MissionRequestInt(*station.target, 1), m.MissionItemInt)
+    assert (heights, after.z) == ([10.0, 10.0], 20.0)
 
 
 async def test_clear_that_is_judged_occupies_the_server() -> None:

@@ -171,6 +171,7 @@ class ArduPilot(Autopilot):
     runs_prearm_checks = True
     calibrates_compasses_by_command = True
     calibration_protocol = "acknowledgements"
+    has_fixed_parameter_encoding = True
     parameter_interval_s: float | None = 0.02
     mission_storage = "ardupilot"
     mission_upload_window = 6

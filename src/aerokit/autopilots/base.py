@@ -476,6 +476,8 @@ class Autopilot:
         return self._bytewise_by_default
 
     _bytewise_by_default = False
+    has_fixed_parameter_encoding = False
+    """True if the encoding of integer parameters is known before the capabilities."""
     parameter_interval_s: float | None = None
     """Minimum interval between PARAM_VALUEs in seconds, for MAV_CMD_SET_MESSAGE_INTERVAL; None if the command has no
     effect.

@@ -115,6 +115,7 @@ class Px4(Autopilot):
     log_directories: ClassVar[tuple[str, str]] = ("/fs/microsd/log", "/log")
     silent_without_logs = True
     _bytewise_by_default = True
+    has_fixed_parameter_encoding = True
     has_parameter_hash = True
     unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # PX4 may send an unknown current as −1 A (-100).
     reposition_purpose: Purpose = "hold"

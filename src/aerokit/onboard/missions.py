@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import InvalidArgument
@@ -12,7 +12,8 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType
 from aerokit.missions import MissionItem
 from aerokit.missions.check import check_items
-from aerokit.protocols.servers.missions import MissionServer
+from aerokit.protocols.servers.host import Channel, ComponentIds, sender_of
+from aerokit.protocols.servers.missions import MAX_CLIENTS, AnyRequest, MissionServer
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest, ComponentServices
@@ -29,7 +30,7 @@ class ComponentMissions:
 
     def __init__(self, services: ComponentServices) -> None:
         self._host, self._tasks, self._commands = services.host, services.tasks, services.commands
-        self._server = MissionServer(self._host, self._accept_or_refuse, on_set_current=self._set_current)
+        self._server = _ConsistentMissionServer(self._host, self._accept_or_refuse, on_set_current=self._set_current)
         self._on_upload: Callable[[str, tuple[MissionItem, ...]], Any] | None = None
         self._on_current: Callable[[int], object] | None = None
         self._commands.add(MavCmd.DO_SET_MISSION_CURRENT, self._do_set_current)
@@ -144,6 +145,47 @@ class ComponentMissions:
         if not is_known or self._on_current is None or await self._commands.call(self._on_current, index) is False:
             raise InvalidArgument(f"the mission cannot continue at item {index}")
         self.set_current(index)
+
+
+class _Download(NamedTuple):
+    items: tuple[MissionItem, ...]
+    used_at: float  # time of the last request
+
+
+class _ConsistentMissionServer(MissionServer):
+    """Sends the items that the MISSION_COUNT of a download has announced, even if they are replaced meanwhile.
+
+    Otherwise the client would get a mixture of two plans.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._downloads: dict[tuple[ComponentIds, int], _Download] = {}  # by client and MAV_MISSION_TYPE
+
+    def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
+        super()._on_request_list(request, channel)
+        kind = request.mission_type
+        if kind in self.lists:
+            self._downloads.pop((sender_of(request), kind), None)
+            self._downloads[sender_of(request), kind] = _Download(self.lists[kind], self._host.now)
+            if len(self._downloads) > MAX_CLIENTS:
+                del self._downloads[next(iter(self._downloads))]
+
+    def _requested_item(self, request: AnyRequest) -> MissionItem | None:
+        key = sender_of(request), request.mission_type
+        download = self._downloads.get(key)
+        if download is None or self._host.now - download.used_at > self.timeout_s:
+            return super()._requested_item(request)
+        self._downloads[key] = download._replace(used_at=self._host.now)
+        return download.items[request.seq] if request.seq < len(download.items) else None
+
+    def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
+        self._downloads.pop((sender_of(ack), ack.mission_type), None)
+        super()._on_ack(ack, channel)
+
+    def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
+        self._downloads.pop((sender_of(message), message.mission_type), None)
+        super()._on_count(message, channel)
 
 
 def _result_of(verdict: object) -> int:

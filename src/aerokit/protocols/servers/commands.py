@@ -161,7 +161,7 @@ UNKNOWN_PROGRESS = 255
 
 
 RESULT_MAX_AGE_S = 5.0
-"""For this time after a command has ended, a repetition gets the same result, and is not executed again."""
+"""For this time after a command has ended, or was repeated, a repetition gets its result, and is not executed again."""
 MAX_RESULTS = 256
 """Maximum number of stored results. If there are more, the oldest is forgotten."""
 
@@ -176,11 +176,11 @@ class CommandResult(Snapshot):
 
 
 class EndedCommand(NamedTuple):
-    """A command that has ended, and the time of its end."""
+    """A command that has ended, and the time of its end or of its last repetition."""
 
     command: ReceivedCommand
     result: CommandResult
-    ended_at: float
+    repeated_at: float
 
 
 class RunningCommand:
@@ -200,14 +200,14 @@ class RunningCommands:
     new commands are rejected in this way while ``MAX_RUNNING_COMMANDS`` run.
 
     A repeated transmission (COMMAND_LONG with a confirmation) does not execute its command again. The answer is
-    IN_PROGRESS while the command runs, and its result for five seconds after the end.
+    IN_PROGRESS while the command runs, and its result for five seconds after the end or the last repetition.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # By MAV_CMD and sender: the command that ended last. Entries have the order in which their commands ended.
+        # By MAV_CMD and sender: the command that ended last. Entries have the order of their times.
         self._ended: dict[tuple[int, ComponentIds], EndedCommand] = {}
         host.on(CommandCancel, self._on_cancel)
 
@@ -224,9 +224,11 @@ class RunningCommands:
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
         ended = self._ended.get((command.command, command.sender))
-        is_recent = ended is not None and self._host.now - ended.ended_at <= RESULT_MAX_AGE_S
+        is_recent = ended is not None and self._host.now - ended.repeated_at <= RESULT_MAX_AGE_S
         # A stop command is executed again, because it may be a new one whose first transmission was lost.
         if ended is not None and is_recent and not is_stop and _is_repeated(command, ended.command):
+            # A sender that loses many answers may repeat its command for longer than `RESULT_MAX_AGE_S`.
+            self._record_result(ended.command, ended.result)
             self._server.answer(command, **ended.result.to_dict())
             return None
         if running is not None and is_stop and self._cancel(running, on_behalf_of=command):

@@ -18,6 +18,8 @@ from aerokit.protocols.servers.host import Channel, ServerHost
 Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
 
 
+# A longer interval is divided, so that the timers of streams that were stopped or replaced do not accumulate.
+_MAX_TIMER_S = 10.0
 _NOT_STREAMED = -1  # interval in MESSAGE_INTERVAL
 
 
@@ -79,7 +81,14 @@ class MessageStreams:
                 stream.is_failing = True
                 raise
         finally:
-            self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
+            self._wait(key, stream, self._host.now + stream.interval_s)
+
+    def _wait(self, key: tuple[Channel, int], stream: _Stream, due_at: float) -> None:
+        """Send the next message of a stream at ``due_at``."""
+        if due_at - self._host.now <= _MAX_TIMER_S:
+            self._host.call_at(due_at, lambda: self._send_stream(key, stream))
+        elif self._streams.get(key) is stream:
+            self._host.call_later(_MAX_TIMER_S, lambda: self._wait(key, stream, due_at))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
         """Send the requested messages. Return DENIED for an unknown id, or FAILED if there is nothing to send yet."""

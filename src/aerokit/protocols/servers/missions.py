@@ -52,6 +52,8 @@ class ItemRefused(Exception):
 
 
 MAX_ITEMS = 2000
+MAX_CLIENTS = 16
+"""Maximum number of clients whose last transfer is remembered."""
 _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
 _Result = MavMissionResult
 
@@ -116,6 +118,8 @@ class MissionServer:
         self._may_set_current = on_set_current  # returns False to refuse a MISSION_SET_CURRENT
         self._capacity = capacity
         self._uploads: dict[int, ListUpload] = {}
+        # By client, in the order of their ends: the upload that ended last, and its answer.
+        self._ended: dict[ComponentIds, tuple[ListUpload, m.MissionAck]] = {}
         self._clearing: m.MissionClearAll | None = None
         """MISSION_CLEAR_ALL on which ``validate`` has not decided yet."""
         on = host.on
@@ -136,6 +140,7 @@ class MissionServer:
     def reset(self) -> None:
         """Drop running transfers, as a reboot does. The stored items are kept."""
         self._uploads.clear()
+        self._ended.clear()
         self._clearing = None
 
     def opaque_id(self, mission_type: int) -> int:
@@ -184,6 +189,9 @@ class MissionServer:
         items = self.lists.get(mission_type, ())
         return items[seq] if 0 <= seq < len(items) else None
 
+    def _requested_item(self, request: AnyRequest) -> MissionItem | None:
+        return self.item(request.mission_type, request.seq)
+
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         seq, kind, as_int = request.seq, request.mission_type, isinstance(request, m.MissionRequestInt)
         current = seq == self.current and kind == MavMissionType.MISSION
@@ -211,7 +219,7 @@ class MissionServer:
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         if (refusal := self._refusal(request, channel)) is not None:
             self._refuse_item(request, refusal, channel)
-        elif (item := self.item(request.mission_type, request.seq)) is None:
+        elif (item := self._requested_item(request)) is None:
             self._refuse_item(request, _Result.INVALID_SEQUENCE, channel)
         else:
             self._host.send(self._message(item, request), channel)
@@ -263,7 +271,12 @@ class MissionServer:
     def _end(self, upload: ListUpload, result: int) -> None:
         self._drop(upload)
         opaque_id = self.opaque_id(upload.mission_type) if result == _Result.ACCEPTED else 0
-        self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
+        answer = m.MissionAck(*upload.client, result, upload.mission_type, opaque_id=opaque_id)
+        self._ended.pop(upload.client, None)
+        self._ended[upload.client] = upload, answer
+        if len(self._ended) > MAX_CLIENTS:
+            del self._ended[next(iter(self._ended))]
+        self._host.send(answer, upload.channel)
 
     def _request_item(self, upload: ListUpload) -> None:
         upload.requested_at = self._host.now
@@ -313,7 +326,14 @@ class MissionServer:
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         """Called for an unexpected item."""
-        # Nothing is sent, because an upload requests its expected item again anyway.
+        # An upload requests its expected item again anyway, so only a repeated last item is answered: like PX4
+        # (mavlink_mission.cpp, handle_mission_item_both), because its client has missed the answer.
+        client = sender_of(message)
+        if client not in self._ended or any(upload.client == client for upload in self._uploads.values()):
+            return
+        upload, answer = self._ended[client]
+        if (message.mission_type, message.seq) == (upload.mission_type, upload.end - 1):
+            self._host.send(answer, upload.channel)
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
         try:

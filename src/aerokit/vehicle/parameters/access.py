@@ -62,6 +62,7 @@ class ParameterAccess:
         self._write_lock = asyncio.Lock()
         self._has_file: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
         self._cached_read_round_trip: RoundTrip | None = None  # see `_read_round_trip`
+        self._has_awaited_capabilities = False  # see `learn_encoding`
         self._rate_users = 0  # number of running operations that need a raised rate of answers
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
         # Last value of each parameter that this program has written; None until the vehicle confirms the value.
@@ -86,6 +87,14 @@ class ParameterAccess:
     def forget(self) -> None:
         self.store.forget()
         self._has_file = None
+        self._has_awaited_capabilities = False
+
+    async def learn_encoding(self) -> None:
+        """Wait for the capabilities if the encoding of integers depends on them, but only once."""
+        if self._transfers.autopilot.has_fixed_parameter_encoding or self._has_awaited_capabilities:
+            return
+        await self._transfers.capabilities()
+        self._has_awaited_capabilities = True
 
     async def download(
         self,
@@ -192,6 +201,7 @@ class ParameterAccess:
     async def _download_list(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         from aerokit.protocols.parameter_list import ParameterList
 
+        await self.learn_encoding()
         transfers = self._transfers
         exchange = ParameterList(
             transfers.system_id,
@@ -219,6 +229,7 @@ class ParameterAccess:
         from aerokit.parameters.renames import other_names
         from aerokit.protocols.parameter_requests import ParameterReads
 
+        await self.learn_encoding()
         transfers, store = self._transfers, self.store
         stale_values = {name: store.stale_value(name) for name in names}
         exchange = ParameterReads(

@@ -54,6 +54,7 @@ class ParameterStore:
         # Maps each name to the value of `updates` at the last message with this parameter.
         self._last_updates: dict[str, int] = {}
         self._stale: dict[str, StaleValue] = {}
+        self._was_bytewise = False  # value of `bytewise` when the last message was decoded
 
     @property
     def table(self) -> ParameterTable:
@@ -94,6 +95,7 @@ class ParameterStore:
         return [
             bus.attach(ParamValue, self._on_param_value, system_id=transfers.system_id),
             bus.attach_event(LinkRestored, self._on_link_restored),
+            transfers.version_cell.observe(lambda _, __: self._on_version()),
         ]
 
     def forget(self) -> None:
@@ -132,13 +134,18 @@ class ParameterStore:
         # Messages about changes were missed, and the link may lead to another vehicle.
         self.is_complete = False
 
+    def _on_version(self) -> None:
+        # The capabilities may show that the known integers were decoded in the wrong way.
+        if self._known and self.bytewise != self._was_bytewise:
+            self.forget()
+
     def _on_param_value(self, message: ParamValue) -> None:
         frame = message.received_frame
         if frame is None or frame.component_id != self._transfers.component_id:
             return
         if message.param_id == HASH_NAME or not message.param_id:
             return  # The hash is sent like a parameter, but is not one.
-        bytewise = self.bytewise
+        bytewise = self._was_bytewise = self.bytewise
         received = parameter_of(message, bytewise)
         name, old = received.name, self._known.get(received.name)
         if old is None and len(self._known) >= MAX_PARAMETERS:

@@ -80,6 +80,7 @@ class NameResolver:
         normalized = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
         store = self._access.store
+        await self._access.learn_encoding()  # This may clear the store.
         answers = await self._access.read(self._names_in_doubt(normalized.values()), idle_timeout_s)
         # If the vehicle reboots meanwhile, the store is cleared, and parameters that were known must also be read.
         while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:

@@ -183,6 +183,10 @@ class Transfers:
         return self._version.latest
 
     @property
+    def version_cell(self) -> StateCell[AutopilotVersion]:
+        return self._version
+
+    @property
     def known_capabilities(self) -> int | None:
         """MAV_PROTOCOL_CAPABILITY bits of the component, None while unknown."""
         version = self._version.latest
