@@ -429,12 +429,17 @@ async def test_late_ack_of_earlier_upload_does_not_confirm_lost_items() -> None:
             if message.seq == 0:
                 on_item(message, channel)
                 flight.copter.send(m.MissionAck(255, 190, Result.ACCEPTED, 0))
+            elif message.seq == 3:
+                flight.copter.send_text(4, "No storage")
 
         flight.copter.handlers[m.MissionItemInt.ID] = lose_items
         other = changed(long_mission(3), 1)
-        with pytest.raises(MissionRejected, match="refused the plan at about item 0; its items differ from those sent"):
+        with pytest.raises(
+            MissionRejected, match=r"refused the plan at about item 0.*differ from those sent"
+        ) as caught:
             await flight.vehicle.mission.upload(other, method="items", only_changes=False, verify=False)
         assert not holds(flight, other)
+        assert "No storage" in caught.value.reasons
 
 
 @pytest.mark.parametrize("older_count", [1, 3, 4, 5, 9, 20])

@@ -451,6 +451,7 @@ class PlanTransfer(Generic[PlanT]):
     async def _send_items(
         self, items: Sequence[MissionItem], method: str, *, verify: bool, may_repeat: bool = True
     ) -> None:
+        started_at = self._context.now()
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
@@ -477,11 +478,12 @@ class PlanTransfer(Generic[PlanT]):
                 return
             # The differences show that the vehicle refused the plan.
             raise MissionRejected(
-                f"{self._name}: the vehicle refused the plan at about item {result.item};"
+                f"{self._name}: the vehicle refused the plan at about item {result.item}, or has changed items;"
                 " its items differ from those sent",
                 result=MavMissionResult.ERROR,
                 item=result.item,
-                reasons=error.differences,
+                # ArduPilot explains its refusal of a whole fence only by a text, e.g. "Fence exceeds storage size".
+                reasons=self._context.session.texts_since(started_at) + error.differences,
             ) from None
 
     async def _send_file(self, items: Sequence[MissionItem], method: str) -> None:
