@@ -109,7 +109,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def expire(self, now: float) -> None:
         if self._is_idle(now):
             self._time_out(now)
-        elif self._has_error:
+        elif self._has_error and self._window == 1:
             self._restart_after_error(now)
         elif self._count is None:
             self._attempt += 1
@@ -169,7 +169,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
             # ERROR may answer a late copy of an item that an earlier upload has sent, so it counts only if the request
-            # is not answered in time.
+            # is not answered in time. ArduPilot (window above 1) sends one for each copy, and has no transfer that it
+            # could drop (MissionItemProtocol.cpp, handle_mission_request_int): the request is only repeated.
             self._has_error = True
         elif result not in (
             MavMissionResult.ACCEPTED,
@@ -267,6 +268,9 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._finish(DownloadResult(items, count=self._count or 0, opaque_id=self._opaque_id))
 
     def _time_out(self, now: float) -> None:
+        if self._has_error:
+            self._reject(MavMissionResult.ERROR)
+            return
         self._outbox += self.cancellation()
         # The caller's item 0 is the first one after home.
         missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)

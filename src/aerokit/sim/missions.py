@@ -16,7 +16,7 @@ from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions import MissionItem
-from aerokit.missions.wire import NO_CLEAR, pack_items, read_header, unpack_items
+from aerokit.missions.wire import HEADER, NO_CLEAR, pack_items, read_header, unpack_items
 from aerokit.protocols.servers.files import EINVAL, ENFILE, ENOENT, FileFault, FileHandle, Mount, UploadedFile
 from aerokit.sim.motion import LocalFrame, Ned
 
@@ -73,7 +73,7 @@ class MissionMount(Mount):
     def open(self, path: str, *, writing: bool) -> FileHandle:
         type_ = _type_of(path)
         if not writing:
-            return _Reader(_packed(self._store.items(type_), type_))
+            return _Reader(self._store, type_)
         if self._writer is not None and not self._writer.is_closed:
             raise FileFault(ENFILE)
         self._writer = _Writer(self._store, type_)
@@ -81,10 +81,20 @@ class MissionMount(Mount):
 
 
 class _Reader(FileHandle):
-    def __init__(self, content: bytes) -> None:
-        self._content = content
+    """Like ArduPilot, it reads the header when it is opened, and each item when it is requested."""
+
+    def __init__(self, store: MissionStore, type_: int) -> None:
+        self._store = store
+        self._type = type_
+        self._items = list(store.items(type_))
+        self._content = _packed(self._items, type_)
+        self._header = self._content[: HEADER.size]
 
     def read(self, offset: int, size: int) -> bytes:
+        items = self._store.items(self._type)
+        if items != self._items:
+            self._items = list(items)
+            self._content = self._header + _packed(self._items, self._type)[HEADER.size :]
         return self._content[offset : offset + size]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from functools import partial
+from typing import Any
 
 import anyio
 import pytest
@@ -53,6 +54,29 @@ async def test_px4_hold_is_sent_in_same_iteration() -> None:
         last_at, last = flight.wire.sent[-1]
         assert isinstance(last, m.CommandLong)
         assert (last_at, last.command) == (now(), MavCmd.DO_REPOSITION)
+
+
+async def test_hold_lost_after_unanswered_change_of_mode_is_repeated() -> None:
+    """On a link with copies, two answers to the change of mode arrive after the hold was sent, which was lost."""
+    async with in_the_air(latency_s=0.5) as flight:
+        flight.pilot_takes_over()
+        await anyio.sleep(2.0)
+        on_command = flight.copter.handlers[m.CommandLong.ID]
+
+        def lose_first_hold(message: m.CommandLong, channel: Any) -> None:
+            if message.command == MavCmd.DO_SET_MODE and message.param2 == BRAKE:
+                flight.copter.handlers[m.CommandLong.ID] = on_command
+            else:
+                on_command(message, channel)
+                on_command(message, channel)
+
+        flight.copter.handlers[m.CommandLong.ID] = lose_first_hold
+        with anyio.move_on_after(0.7):
+            async with flight.vehicle.guided.velocity():
+                raise AssertionError("entered too early")
+        await anyio.sleep(8.0)
+        assert flight.wire.mode_orders()[-2:] == [BRAKE, BRAKE]
+        assert flight.copter.mode.number == BRAKE
 
 
 @pytest.mark.parametrize("silent_s", [3.0, 60.0])

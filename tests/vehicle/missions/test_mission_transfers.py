@@ -31,6 +31,7 @@ from aerokit.position import Position
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.protocols.ftp import FtpMessage
 from aerokit.sim import SimulatedCopter
+from aerokit.sim.missions import MissionMount
 
 pytestmark = pytest.mark.anyio
 
@@ -201,6 +202,57 @@ async def test_plan_replaced_by_another_station_during_download_is_read_again() 
         assert holds(flight, downloaded)
 
 
+@pytest.mark.parametrize("index", [1, 28])
+async def test_file_replaced_by_another_station_during_read_is_read_again(
+    index: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another station, over a link of its own, replaces an item that was already read, or one that was not."""
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(30))
+        open_file = MissionMount.open
+        replacement = changed(long_mission(30), index).to_items(home_is_item_0=True)
+
+        def open_and_replace(*args: Any, writing: bool) -> Any:
+            handle = open_file(*args, writing=writing)
+            read = handle.read
+
+            def read_and_replace(offset: int, size: int) -> bytes:
+                if offset >= 3 * 239:
+                    flight.copter.missions.replace(0, replacement)
+                return read(offset, size)
+
+            monkeypatch.setattr(handle, "read", read_and_replace)
+            return handle
+
+        monkeypatch.setattr(MissionMount, "open", open_and_replace)
+        downloaded = await flight.vehicle.mission.download(method="ftp")
+        assert holds(flight, downloaded)
+        assert downloaded[index].z == 33.0
+
+
+async def test_download_by_file_waits_for_upload_of_another_station() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(30))
+        flight.vehicle.connection.link.write(FrameEncoder(77, 191).encode(m.MissionCount(1, 1, 20)))
+        with pytest.raises(OperationTimeout):
+            await flight.vehicle.mission.download(method="ftp", timeout=3)
+
+
+async def test_download_by_items_of_longer_new_plan_is_read_again() -> None:
+    """Another station, over a link of its own, replaces the plan by a longer one."""
+    async with open_flight(latency_s=0.05) as flight:
+        mission = flight.vehicle.mission
+        await mission.upload(long_mission(30), method="items")
+
+        def on_item(_: m.MissionItemInt) -> None:
+            detach()
+            flight.copter.missions.replace(0, changed(long_mission(40), 0).to_items(home_is_item_0=True))
+
+        detach = flight.vehicle.connection.bus.attach(m.MissionItemInt, on_item)
+        downloaded = await mission.download(method="items")
+        assert holds(flight, downloaded)
+
+
 async def test_px4_plan_changed_by_another_station() -> None:
     async with open_px4() as flight:
         await flight.vehicle.mission.upload(long_mission(5))
@@ -330,7 +382,24 @@ async def test_plan_cut_after_partial_upload_is_verification_failed() -> None:
         with pytest.raises(VerificationFailed) as caught:
             await flight.vehicle.mission.upload(changed(long_mission(30), 5, 6, 7))
         assert flight.wire.all(m.MissionWritePartialList)
-        assert caught.value.differences[0] == "there are 2 items instead of 3"
+        assert caught.value.differences[0] == "there are 7 items instead of 30"
+
+
+async def test_other_item_replaced_during_partial_upload_is_verification_failed() -> None:
+    """Another station, over a link of its own, replaces an item that this upload keeps."""
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(30))
+
+        def replace(message: Any) -> None:
+            if message.type == Result.ACCEPTED:
+                flight.copter.missions.replace(0, changed(long_mission(30), 5, 20).to_items(home_is_item_0=True))
+
+        flight.wire.clear()
+        flight.vehicle.connection.bus.attach(m.MissionAck, replace)
+        with pytest.raises(VerificationFailed) as caught:
+            await flight.vehicle.mission.upload(changed(long_mission(30), 5))
+        assert flight.wire.all(m.MissionWritePartialList)
+        assert caught.value.differences == ("item 20 (NAV_WAYPOINT): z is 33.0 instead of 20.0",)
 
 
 async def test_ambiguous_upload_without_read_back_is_unknown() -> None:
@@ -360,12 +429,17 @@ async def test_late_ack_of_earlier_upload_does_not_confirm_lost_items() -> None:
             if message.seq == 0:
                 on_item(message, channel)
                 flight.copter.send(m.MissionAck(255, 190, Result.ACCEPTED, 0))
+            elif message.seq == 3:
+                flight.copter.send_text(4, "No storage")
 
         flight.copter.handlers[m.MissionItemInt.ID] = lose_items
         other = changed(long_mission(3), 1)
-        with pytest.raises(MissionRejected, match="refused the plan at about item 0; its items differ from those sent"):
+        with pytest.raises(
+            MissionRejected, match=r"refused the plan at about item 0.*differ from those sent"
+        ) as caught:
             await flight.vehicle.mission.upload(other, method="items", only_changes=False, verify=False)
         assert not holds(flight, other)
+        assert "No storage" in caught.value.reasons
 
 
 @pytest.mark.parametrize("older_count", [1, 3, 4, 5, 9, 20])

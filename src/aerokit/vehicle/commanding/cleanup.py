@@ -21,7 +21,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags
-from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, STEERING, was_armed_by_order
+from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, MODE_GRACE_S, STEERING, was_armed_by_order
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -187,21 +187,31 @@ class FlightCleanup:
             return False
         # If `only_stops` is True, `stop_in` has probably sent the hold already. It is then repeated after a HEARTBEAT.
         can_send_now = self._arbiter.is_state_recent and not order.only_stops
+        # Each change of the mode has the same MAV_CMD, so the next COMMAND_ACK may answer the one of `order`.
+        is_ack_ambiguous = not self._holds_by_reposition and session.connection.now() < order.given_at + MODE_GRACE_S
         if can_send_now:
             command, *params = self._hold_command(mode)
             self._session.commands.send_unconfirmed(int(command), *params)
             # The new order replaces the abandoned one, whose modes the vehicle may still report.
             order = self._arbiter.order(*order.modes, mode)
             self._arbiter.doubt_mode()
-        self._task.start(partial(self._complete_hold, mode, order, is_sent=can_send_now))
+        self._task.start(
+            partial(self._complete_hold, mode, order, is_sent=can_send_now, is_ack_ambiguous=is_ack_ambiguous)
+        )
         return True
 
-    async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
-        """Wait for the confirmation of a hold. Without one, send it again after the next HEARTBEAT."""
+    async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool, is_ack_ambiguous: bool) -> None:
+        """Wait for the confirmation of a hold. Without one, send it again after the next HEARTBEAT.
+
+        With ``is_ack_ambiguous``, a HEARTBEAT after the COMMAND_ACK must report the mode.
+        """
         for _ in range(MAX_HOLD_ATTEMPTS):
             try:
                 if is_sent:
                     await self._confirm_hold(mode, order)
+                    if is_ack_ambiguous:
+                        acknowledged_at = self._session.connection.now()
+                        await self._sender.await_mode(mode, order, [], MODE_GRACE_S, acknowledged_at)
                     return
                 await self._session.wait_for_heartbeat()
                 if not order.end and not self._session.telemetry.is_confirmed_disarmed:

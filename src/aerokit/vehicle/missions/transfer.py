@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 ResultT = TypeVar("ResultT")
 # Seconds after a refusal in which the texts that explain it may arrive.
 REFUSAL_TEXT_DELAY_S = 0.3
+# A download reads a plan's file at most this many times, if other stations keep changing the plan.
+MAX_FILE_READS = 5
+CRC_INVERSION = 0xFFFFFFFF
 UNKNOWN_CONTENT = "whether the vehicle has the new items is unknown: call download()"
 
 
@@ -84,16 +88,27 @@ class PlanChannel:
 
     async def receive(self, only: Sequence[int] | None = None) -> DownloadResult:
         """Read the items with the numbers ``only``; None: all items; empty: none, but their count."""
+        options = self._wire_options
+        if only is not None and not only:
+            options["on_progress"] = None  # A count is no progress.
         received = await self._run(
             MissionDownload(
                 *self._target,
                 window=self._context.autopilot.mission_download_window,
                 only=only,
                 supports_int=await self._supports_int(),
-                **self._wire_options,
+                **options,
             )
         )
         return received.replace(items=self._normalized(received.items))
+
+    async def receive_one_plan(self) -> DownloadResult:
+        """Read all items again until their number is still the same afterwards, unless the vehicle reports an id."""
+        while True:
+            received = await self.receive()
+            # If another station has replaced the plan by one with the same number of items, ArduPilot does not show it.
+            if received.opaque_id or (await self.receive(only=())).count == received.count:
+                return received
 
     async def clear(self) -> None:
         await self._run(MissionClear(*self._target, **self._wire_options))
@@ -112,10 +127,32 @@ class PlanChannel:
             raise
         self._has_changed = True
 
-    async def read_file(self) -> tuple[MissionItem, ...]:
-        """Read the plan's file. Raises RemoteProtocolError for a plan of another kind."""
-        data = await self._context.files().read(self._path, **self._options)
-        return self._normalized(unpack_items(data, self.mission_type))
+    async def read_file(self, *, must_be_one_plan: bool) -> tuple[MissionItem, ...]:
+        """Read the plan's file. With ``must_be_one_plan``, read again if another station has changed it meanwhile.
+
+        Raises RemoteProtocolError for a plan of another kind, or if each read was in vain.
+        """
+        previous_data = None
+        for _ in range(MAX_FILE_READS):
+            data = await self._context.files().read(self._path, **self._options)
+            if not must_be_one_plan or await self._is_one_plan(data, previous_data):
+                return self._normalized(unpack_items(data, self.mission_type))
+            previous_data = data
+        raise RemoteProtocolError(f"read {self._path}: the plan was changed during each of {MAX_FILE_READS} reads")
+
+    async def _is_one_plan(self, data: bytes, previous_data: bytes | None) -> bool:
+        """Return True unless ``data`` may have parts of two plans. Wait while another station uploads its items."""
+        # ArduPilot makes each block of the file from the plan that it has at that moment, even in the middle of an
+        # upload (AP_Filesystem_Mission.cpp, read). The mission protocol refuses requests during an upload.
+        if self.mission_type in self._context.autopilot.overwrites_plans_in_place:
+            await self.receive(only=())
+        if data == previous_data:
+            return True
+        try:
+            crc = await self._context.files().crc32(self._path, idle_timeout_s=self._options["idle_timeout_s"])
+        except FileError:
+            return True  # The vehicle cannot compute it.
+        return crc == zlib.crc32(data, CRC_INVERSION) ^ CRC_INVERSION  # See `Files.crc32`.
 
     def _normalized(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
         # Fences and rally points have no autocontinue; ArduPilot returns False for them.
@@ -324,7 +361,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def download(self, method: str) -> PlanT:
         with self._describe_file_timeout(method):
-            items = await self._read(method)
+            items = await self._read(method, must_be_one_plan=True)
         return self._plan_type.from_items(items, home_is_item_0=bool(self._offset))
 
     async def clear(self) -> None:
@@ -355,10 +392,10 @@ class PlanTransfer(Generic[PlanT]):
             self._cache.set(uploaded, self._context.now())
         return False
 
-    async def _read(self, method: str) -> tuple[MissionItem, ...]:
+    async def _read(self, method: str, *, must_be_one_plan: bool = False) -> tuple[MissionItem, ...]:
         while True:
             changes = self._cache.changes
-            received = await self._receive(method)
+            received = await self._receive(method, must_be_one_plan=must_be_one_plan)
             if not received.items and await self._was_fence_hidden():
                 continue
             if self._cache.changes == changes:  # No other station has changed the plan meanwhile.
@@ -377,16 +414,16 @@ class PlanTransfer(Generic[PlanT]):
             await status.wait_until(lambda state: state not in BOOT_STATES, description="the end of the boot")
         return status.latest not in BOOT_STATES
 
-    async def _receive(self, method: str) -> DownloadResult:
+    async def _receive(self, method: str, *, must_be_one_plan: bool) -> DownloadResult:
         if await self._uses_file(method):
             try:
-                items = await self._channel.read_file()
+                items = await self._channel.read_file(must_be_one_plan=must_be_one_plan)
             except (FileError, FileTimeout, RemoteProtocolError) as error:
                 self._on_file_error(error, method)
             else:
                 self._cache.has_file = True
                 return DownloadResult(items, len(items), opaque_id=0)
-        return await self._channel.receive()
+        return await (self._channel.receive_one_plan() if must_be_one_plan else self._channel.receive())
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
         """Return True if the plan is to be transferred as a file.
@@ -435,6 +472,7 @@ class PlanTransfer(Generic[PlanT]):
     async def _send_items(
         self, items: Sequence[MissionItem], method: str, *, verify: bool, may_repeat: bool = True
     ) -> None:
+        started_at = self._context.now()
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
@@ -461,11 +499,12 @@ class PlanTransfer(Generic[PlanT]):
                 return
             # The differences show that the vehicle refused the plan.
             raise MissionRejected(
-                f"{self._name}: the vehicle refused the plan at about item {result.item};"
+                f"{self._name}: the vehicle refused the plan at about item {result.item}, or has changed items;"
                 " its items differ from those sent",
                 result=MavMissionResult.ERROR,
                 item=result.item,
-                reasons=error.differences,
+                # ArduPilot explains its refusal of a whole fence only by a text, e.g. "Fence exceeds storage size".
+                reasons=self._context.session.texts_since(started_at) + error.differences,
             ) from None
 
     async def _send_file(self, items: Sequence[MissionItem], method: str) -> None:
@@ -500,15 +539,20 @@ class PlanTransfer(Generic[PlanT]):
             return True
         if changed_seqs is None or not self._is_worthwhile(changed_seqs, len(items)):
             return False
-        return await self._replace_items(items, changed_seqs, verify=verify)
+        if not await self._replace_items(items, changed_seqs):
+            return False
+        if verify:  # Another station may have replaced other items since they were read.
+            with self._describe_file_timeout(method, f"; all changed items were sent, {UNKNOWN_CONTENT}"):
+                await self._verify(items, method)
+        return True
 
-    async def _replace_items(self, items: Sequence[MissionItem], changed_seqs: list[int], *, verify: bool) -> bool:
+    async def _replace_items(self, items: Sequence[MissionItem], changed_seqs: list[int]) -> bool:
         vehicle_items = list(self._cache.items or ())
         # The vehicle's plan is unknown until all parts are confirmed, because the call may fail or be cancelled.
         self._cache.forget(self._context.now())
         changes_before = self._cache.changes
         for part in _consecutive_ranges(changed_seqs):
-            if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
+            if not await self._send_part(items[part.start : part.stop], part.start):
                 return False
             vehicle_items[part.start : part.stop] = items[part.start : part.stop]
         if self._cache.changes != changes_before:  # Another station has replaced the plan meanwhile.
@@ -516,12 +560,12 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.set(vehicle_items, self._context.now())
         return True
 
-    async def _send_part(self, items: Sequence[MissionItem], first_seq: int, *, verify: bool) -> bool:
+    async def _send_part(self, items: Sequence[MissionItem], first_seq: int) -> bool:
         """Send consecutive items. Return False if all items must be sent instead."""
         result = await self._channel.send_part(items, first_seq)
         if result is None:
             return False
-        if verify or not result.is_confirmed:
+        if not result.is_confirmed:
             seqs = range(first_seq, first_seq + len(items))
             received = await self._channel.receive(only=seqs)
             self._compare(dict(zip(seqs, items)), dict(zip(seqs, received.items)))  # noqa: B905 - may be shorter
