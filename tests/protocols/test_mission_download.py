@@ -66,7 +66,7 @@ def test_mission_download_ignores_errors_for_late_items_of_upload() -> None:
     assert sum(isinstance(message, m.MissionRequestList) for message in exchange.take_outbox()) == 1
 
 
-def test_mission_download_on_slow_link_ignores_errors_for_late_items_of_upload() -> None:
+def test_mission_download_on_slow_link_ignores_errors_for_late_items() -> None:
     """The round trip was measured on a faster link, so ERRORs arrive after each time-out and before the answer."""
     exchange = download(round_trip=RoundTrip(0.1))
     exchange.start(0.0)

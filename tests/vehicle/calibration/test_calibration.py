@@ -30,7 +30,7 @@ from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.calibration.calibration import Calibration
 from aerokit.vehicle.calibration.values import CalibrationPose as Pose
-from aerokit.vehicle.calibration.values import CalibrationStep
+from aerokit.vehicle.calibration.values import CalibrationResult, CalibrationStep
 
 pytestmark = pytest.mark.anyio
 CALIBRATION = MavCmd.PREFLIGHT_CALIBRATION
@@ -88,7 +88,7 @@ async def test_ardupilot_compass_reports_progress_and_fitness() -> None:
         assert progress[0] == 0
         assert len(progress) > 20
         result = steps[-1].result
-        assert result is not None
+        assert results[-1] is not None
         assert result.reboot_due
         assert [(fit.compass, fit.fitness_mgauss) for fit in result.compasses] == [(0, 5.0), (1, 5.0), (2, 5.0)]
         assert orders(wire, MavCmd.DO_ACCEPT_MAG_CAL) == [(0,) * 7]
@@ -455,6 +455,7 @@ async def test_late_result_of_px4_is_received_after_a_long_step() -> None:
     """The vehicle ends the calibration while the program handles a step."""
     texts: list[tuple[Any, ...]] = []
     calibrating = 0  # number of steps in the state CALIBRATING
+    results: list[CalibrationResult | None] = []
     async with stage(SimulatedPx4) as (px4, vehicle, _):
         send_text = px4.send_text
 
@@ -463,14 +464,14 @@ async def test_late_result_of_px4_is_received_after_a_long_step() -> None:
                 send_text(*arguments)
 
         async for step in vehicle.calibrate.gyroscope():
-            result = step.result
+            results.append(step.result)
             calibrating += vehicle.system_status.latest == MavState.CALIBRATING
             if calibrating == 2 and not texts:
                 px4.send_text = lambda *arguments: texts.append(arguments)
                 await vehicle.system_status.wait_until(lambda status: status != MavState.CALIBRATING)
                 await anyio.sleep(2.0)
                 asyncio.get_running_loop().call_later(0.5, send_all)
-    assert result is not None
+    assert results[-1] is not None
 
 
 async def test_silent_vehicle_raises_heartbeat_timeout() -> None:
