@@ -88,7 +88,7 @@ async def test_ardupilot_compass_reports_progress_and_fitness() -> None:
         assert progress[0] == 0
         assert len(progress) > 20
         result = steps[-1].result
-        assert results[-1] is not None
+        assert result is not None
         assert result.reboot_due
         assert [(fit.compass, fit.fitness_mgauss) for fit in result.compasses] == [(0, 5.0), (1, 5.0), (2, 5.0)]
         assert orders(wire, MavCmd.DO_ACCEPT_MAG_CAL) == [(0,) * 7]
