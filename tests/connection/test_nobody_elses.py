@@ -268,6 +268,15 @@ async def test_may_move_accepts_any_host_after_silence_only(link: PeerKeepingLin
         assert events.RouteChanged(vehicle.connection.now(), 1, 1, "14550@copter", "666@stranger") in duplicates
 
 
+async def test_radio_status_moves_no_route(link: PeerKeepingLink) -> None:
+    """It is accepted without a signature, so anyone can forge it."""
+    async with flown(link, may_move=True) as (vehicle, _):
+        await anyio.sleep(5)
+        with vehicle.connection.subscribe(RadioStatus):
+            Copter(link, 5).send("666@stranger", RadioStatus(1, 2, 3, 4, 5, 6, 7))
+        assert peer_of(vehicle, link) == "14550@copter"
+
+
 async def test_other_host_that_continues_stream_takes_route_after_silence(link: PeerKeepingLink) -> None:
     """The vehicle moves from Wi-Fi to the mobile network: same counter, same clock."""
     async with flown(link) as (vehicle, copter):

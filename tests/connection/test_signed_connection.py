@@ -13,6 +13,7 @@ import pytest
 
 from aerokit import Signing, SigningKey, Vehicle, connect, events, open_connection
 from aerokit.connection.connection import Connection
+from aerokit.connection.signatures import SignatureFilter
 from aerokit.errors import (
     BusyError,
     CommandTimeout,
@@ -75,6 +76,39 @@ async def test_key_is_set_up_used_and_removed(make: Any) -> None:
         assert [simulated.signing.key, vehicle.connection.signing] == [None, None]
         await vehicle.arm()
         assert signing.frames_refused == 0
+
+
+@pytest.mark.parametrize("make", [radio_copter, SimulatedPx4])
+@pytest.mark.parametrize("removes_first", [False, True])
+async def test_vehicle_accepts_our_frames_after_change_of_key(make: Any, removes_first: bool) -> None:
+    """The vehicle remembers our last timestamp, which was ahead of the clock, when the key changes."""
+    async with connected(make()) as vehicle:
+        await vehicle.wait_ready()
+        ahead = timestamp_file.timestamp_at(vehicle.connection.unix_time() + 30)
+        await vehicle.setup_signing(Signing(KEY, timestamp=ahead))
+        await vehicle.arm()
+        await vehicle.disarm()
+        if removes_first:
+            await vehicle.setup_signing(None)
+        await vehicle.setup_signing(Signing(WRONG))
+        await vehicle.arm()
+
+
+def test_delayed_frames_with_former_key_do_not_end_handover() -> None:
+    vehicle, signatures = FrameEncoder(1, 1), SignatureFilter(FrameEncoder(255, 190), lambda: 1.8e9, lambda _: None)
+
+    def is_switched(key: SigningKey, *received_at: float) -> list[bool]:
+        vehicle.signing = Signing(key)
+        with signatures.key_handover(Signing(key), 1, 1) as switched:
+            switches = []
+            for at in received_at:
+                signatures.admits(Frame.parse(vehicle.encode(Heartbeat(2, 3, 81, 0, 4), 1.8e9 + at), at))
+                switches.append(switched.is_set())
+            return switches
+
+    assert is_switched(KEY, 1.0) == [True]
+    assert is_switched(WRONG, 2.0) == [True]
+    assert is_switched(KEY, 2.1, 3.9, 4.1) == [False, False, True]
 
 
 async def test_whole_flight_signed() -> None:

@@ -5,23 +5,25 @@ from __future__ import annotations
 import asyncio
 import math
 import random
+import time
 from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
 import pytest
 from hub_stage import COPTER, STATION, Program, SlowLink, settle, until
-from test_hub import virtual
+from test_hub import KEY, virtual
 from test_hub_sockets import ORDER, of, to
 from test_routing import Stage, order
 
+from aerokit import Signing
 from aerokit.connection.frame_receiver import MAX_PEERS, MAX_UNVERIFIED_PEERS
 from aerokit.connection.routes import MAX_ROUTES, PEER_TTL_S, ROUTE_TIMEOUT_S
 from aerokit.hub import Endpoint, Hub, HubEvent, switch
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import Attitude, ParamRequestList
+from aerokit.mavlink.messages import Attitude, ParamRequestList, RadioStatus
 from aerokit.transport import Peer
 
 MAX_CLIENTS = 64
@@ -156,6 +158,40 @@ async def ordered(link: PeersLink, station: Program) -> list[Peer]:
     station.send(ORDER)
     await settle()
     return [peer for peer, message_id in link.sent if message_id == ORDER.ID]
+
+
+@virtual
+async def test_frame_signed_by_hub_is_refused_if_replayed_to_it() -> None:
+    """A stranger that hears the radio sends a command back to the hub, which must not sign it again."""
+    link, station = PeersLink(), Program(255, 190)
+    written: list[bytes] = []
+    link.write = lambda data, peer=None: written.append(data)  # type: ignore[method-assign]
+    async with station, Hub([Endpoint(link, name="radio", signing=Signing(KEY)), station.endpoint("station")]) as hub:
+        vehicle = FrameEncoder(1, 1)
+        vehicle.signing = Signing(KEY)
+        link.receiver.bytes_received(vehicle.encode(COPTER, time.time()), "14550@copter")
+        station.send(STATION, ORDER)
+        await settle()
+        replayed = tuple(written)
+        assert len(replayed) == 2
+        written.clear()
+        for data in replayed:
+            link.receiver.bytes_received(data, "666@stranger")
+        await settle()
+        assert written == []
+        assert hub.endpoints[0].dropped == {"refused": 2}
+
+
+@virtual
+async def test_radio_status_moves_no_route() -> None:
+    """Radios send it unsigned, so anyone can forge it."""
+    link, station = PeersLink(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="radio"), station.endpoint("station")]):
+        link.send("14550@copter", FrameEncoder(1, 1), COPTER)
+        await settle()
+        await asyncio.sleep(5)
+        link.send("666@stranger", FrameEncoder(1, 1), RadioStatus(1, 2, 3, 4, 5, 6, 7))
+        assert await ordered(link, station) == ["14550@copter"]
 
 
 @virtual

@@ -96,6 +96,15 @@ def test_unknown_component_is_reached_by_its_system(stage: Stage) -> None:
     assert stage.receive("b", order(1, 1), 1, 100) == {"a"}
 
 
+def test_radio_status_makes_and_moves_no_route(stage: Stage) -> None:
+    stage.receive("a", COPTER)
+    stage.now += 10
+    stage.receive("b", RadioStatus(0, 0, 0, 0, 0, 0, 0))
+    stage.receive("b", RadioStatus(0, 0, 0, 0, 0, 0, 0), 7)
+    assert stage.receive("c", order(1), 255, 190) == {"a"}
+    assert stage.receive("c", order(7), 255, 190) == set()
+
+
 def test_frame_never_goes_back(stage: Stage) -> None:
     stage.receive("a", COPTER)
     assert stage.receive("a", order(1), 255, 190) == set()

@@ -239,6 +239,21 @@ def test_invalid_signature_does_not_advance_timestamp() -> None:
     assert listener.accepts(framed(signed(Signing(KEY))))
 
 
+def test_own_frame_is_refused_as_replay_on_all_links() -> None:
+    own = Signing(KEY)
+    frame = framed(signed(own, now=NOW))
+    assert own.check(frame, NOW) is Refusal.REPLAYED
+    assert own.for_link(1).check(frame, NOW) is Refusal.REPLAYED
+    assert own.check(framed(signed(Signing(KEY), now=NOW + 1)), NOW + 1) is None
+
+
+def test_remembered_own_signatures_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aerokit.mavlink.signing.MAX_OWN_SIGNATURES", 10)
+    own = Signing(KEY)
+    frames = [framed(signed(own, sequence=number)) for number in range(11)]
+    assert [own.would_accept(frame) for frame in frames] == [True] + [False] * 10
+
+
 def test_trimmed_payload_is_signed_as_sent() -> None:
     encoder = FrameEncoder(1, 1)
     encoder.signing = Signing(KEY)

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 # ATTITUDE_QUATERNION, LOCAL_POSITION_NED and GLOBAL_POSITION_INT.
 _BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 
+# RADIO_STATUS and RADIO. They move no route, because telemetry radios send them under their own ids, without a
+# signature, and anyone can forge them.
+_RADIO_MESSAGE_IDS = (109, 166)
+
 MIN_TAKEOVER_FRAMES = 3
 
 
@@ -227,6 +231,8 @@ class Routes:
 
         Returns True if the route was changed. ``is_signed`` is True if the frame is signed with our key.
         """
+        if frame.message_id in _RADIO_MESSAGE_IDS:
+            return False
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.encoder import FrameEncoder
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.messages import Heartbeat
-    from aerokit.mavlink.signing import Refusal, Signing
+    from aerokit.mavlink.signing import Refusal, Signing, SigningKey
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -26,6 +27,10 @@ logger: logging.Logger = logging.getLogger("aerokit")
 # key sends a signed heartbeat each second.
 MIN_UNSIGNED_FRAMES = 3
 MIN_UNSIGNED_S = 2.0
+
+# For this time after a switch to another key, delayed frames with the former key may arrive. They do not prove that the
+# component uses the former key again.
+DELAYED_FRAMES_S = 2.0
 
 
 class SignatureFilter:
@@ -40,6 +45,8 @@ class SignatureFilter:
         self._encoder, self._unix_time, self._publish = encoder, unix_time, publish
         self._reported: set[Refusal] = set()  # reasons that were already logged
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
+        self._left_keys: dict[SigningKey, float] = {}  # maps former keys to the time of the switch to the next key
+        self._timestamp = 0  # timestamp of the last `Signing` that was replaced
         self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # last logged error of writing the file of ``Signing(keep=…)``
         self.admits_all: bool = True
@@ -50,6 +57,13 @@ class SignatureFilter:
     def set_signing(self, signing: Signing | None) -> None:
         """Sign and verify with this key from now on (None: neither). Raises InvalidArgument with MAVLink 1."""
         check_signing(signing, self._encoder.version)
+        former = self._encoder.signing
+        if former is not None:
+            self._timestamp = max(self._timestamp, former.timestamp)
+        if signing is not None:
+            # ArduPilot remembers our last timestamp, whatever the key was (signing_streams in GCS_Signing.cpp), and
+            # refuses frames with an earlier one.
+            signing.timestamp = max(signing.timestamp, self._timestamp)
         self._encoder.signing = signing
         self._update()
 
@@ -71,7 +85,9 @@ class SignatureFilter:
             raise BusyError("setup_signing: another key handover on this connection is in progress")
         self._is_handing_over = True
         switched = asyncio.Event()
-        self._handover = _Handover(signing, (system_id, component_id), switched)
+        left_at = -math.inf if signing is None else self._left_keys.get(signing.key, -math.inf)
+        not_before = left_at + DELAYED_FRAMES_S
+        self._handover = _Handover(signing, (system_id, component_id), switched, not_before)
         self._update()
         try:
             yield switched
@@ -92,6 +108,10 @@ class SignatureFilter:
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
         if handover is not None and is_of_handover and handover.is_proved_by(frame, self._unix_time()):
             self._handover = None
+            former, now = self._encoder.signing, frame.received_at
+            self._left_keys = {key: at for key, at in self._left_keys.items() if now - at < DELAYED_FRAMES_S}
+            if former is not None:
+                self._left_keys[former.key] = now
             self.set_signing(handover.signing)
             handover.switched.set()
         signing = self._encoder.signing
@@ -154,9 +174,12 @@ def _is_signed_with_a_key(frame: Frame) -> bool:
 class _Handover:
     """A key handover in progress: one component is changing to another signing key, or to none."""
 
-    def __init__(self, signing: Signing | None, source: tuple[int, int], switched: asyncio.Event) -> None:
+    def __init__(
+        self, signing: Signing | None, source: tuple[int, int], switched: asyncio.Event, not_before: float
+    ) -> None:
         self.signing, self.switched = signing, switched
         self._source = source  # (system id, component id)
+        self._not_before = not_before  # Frames that were received earlier prove nothing.
         # Number of unsigned frames since the last signed one, and the time of the first of them.
         self._unsigned_count, self._unsigned_since = 0, 0.0
 
@@ -166,7 +189,7 @@ class _Handover:
     def is_proved_by(self, frame: Frame, unix_time_s: float) -> bool:
         """Record a frame of the component. Return True if it proves that the component uses the new key."""
         if self.signing is not None:
-            return self.signing.would_accept(frame, unix_time_s)
+            return frame.received_at >= self._not_before and self.signing.would_accept(frame, unix_time_s)
         if _is_signed_with_a_key(frame):
             self._unsigned_count = 0
             return False

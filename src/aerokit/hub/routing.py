@@ -37,7 +37,8 @@ MAX_PLANS = 4096
 
 _HEARTBEAT = 0
 _SETUP_SIGNING = 256
-_RADIOS = (109, 166)  # RADIO_STATUS, RADIO
+# RADIO_STATUS and RADIO. They make and move no route, because signed endpoints accept them without a signature.
+_RADIOS = (109, 166)
 _UNKNOWN_SENDER = Sender(0, 0, -math.inf)
 
 
@@ -222,7 +223,7 @@ class Router(Generic[PortT]):
         if sender is None:
             if message_id not in self._offsets and self._targets.is_unknown(message_id):
                 return self._unknown  # The checksum of an unknown message cannot be checked, so the frame may be noise.
-            sender = self._add_sender(source, ingress, now)
+            sender = self._add_sender(source, ingress, now, may_store=message_id not in _RADIOS)
         number, recent = ingress.number, self._recent
         if now >= recent.rotate_at or len(recent.newer) >= MAX_RECENT_FRAMES:
             recent.rotate(now)
@@ -238,7 +239,7 @@ class Router(Generic[PortT]):
                 return refusal
         if sender.port_number == number:
             sender.received_at = now
-        else:
+        elif message_id not in _RADIOS:
             # An autopilot has priority over other senders with its ids, so its first HEARTBEAT moves the route at once.
             must_move = message_id == _HEARTBEAT and not sender.is_autopilot and is_autopilot(body)
             self._record_at_other_port(sender, ingress, now, must_move)
@@ -265,9 +266,9 @@ class Router(Generic[PortT]):
 
     # ------------------------------------------------------------------------------------ senders
 
-    def _add_sender(self, source: int, ingress: Ingress[PortT], now: float) -> Sender:
+    def _add_sender(self, source: int, ingress: Ingress[PortT], now: float, *, may_store: bool) -> Sender:
         sender = Sender(source, ingress.number, now)
-        if len(self._senders) < MAX_ROUTES or self._make_room(now):
+        if may_store and (len(self._senders) < MAX_ROUTES or self._make_room(now)):
             self._senders[source] = sender
             self._without_heartbeat[source] = None
             self.forget_plans()

@@ -34,6 +34,10 @@ ONE_MINUTE = 60 * TICKS_PER_S
 # create one.
 MAX_STREAMS = 1024
 
+# Maximum number of stored own signatures: those of a minute, with 270 frames a second. A replay that is older than a
+# minute is refused as too old, unless its sender is also received.
+MAX_OWN_SIGNATURES = 16_384
+
 # RADIO_STATUS (109) and RADIO (166) come from telemetry radios, which have no key.
 ALWAYS_UNSIGNED = frozenset((109, 166))
 
@@ -184,6 +188,9 @@ class Signing:
         self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
         """Last timestamp of each (system id, component id, link id). Objects from :meth:`for_link` share this dict."""
+        # Hashes of our last signatures, in the order of signing. If one of our frames is replayed to us, `streams` does
+        # not show it, because we have not received the frame before.
+        self._own_signatures: dict[bytes, None] = {}
 
     def for_link(self, link_id: int) -> Signing:
         """Return a `Signing` for another link (0–255) with the same key.
@@ -192,6 +199,7 @@ class Signing:
         """
         signing = Signing(self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned)
         signing.streams = self.streams
+        signing._own_signatures = self._own_signatures
         signing._timestamp_file = self._timestamp_file
         return signing
 
@@ -212,7 +220,11 @@ class Signing:
             raise InvalidArgument(f"the timestamps of {self.key!r} are exhausted: use another key")
         self._advance(timestamp + 1)  # The next frame must have a later timestamp.
         link_and_timestamp = bytes((self.link_id,)) + timestamp.to_bytes(6, "little")
-        return link_and_timestamp + self._hash(frame + link_and_timestamp)
+        signature_hash = self._hash(frame + link_and_timestamp)
+        self._own_signatures[signature_hash] = None
+        if len(self._own_signatures) > MAX_OWN_SIGNATURES:
+            del self._own_signatures[next(iter(self._own_signatures))]
+        return link_and_timestamp + signature_hash
 
     def accepts(self, frame: Frame, now: float = 0.0) -> bool:
         """Return True if a frame has a valid signature, or needs none. Other frames are counted as refused."""
@@ -264,6 +276,8 @@ class Signing:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
             return Refusal.WRONG_SIGNATURE
+        if frame.raw[-_HASH_LENGTH:] in self._own_signatures:
+            return Refusal.REPLAYED
         stream, timestamp = _stream_and_timestamp(frame)
         last = self.streams.get(stream)
         if last is None:
