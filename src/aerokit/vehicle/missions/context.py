@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
@@ -56,10 +56,6 @@ FINAL_ITEM_MAX_AGE_S = 3.0
 STALE_STATE_S = 3.0
 # Every MISSION_CURRENT is compared with these members. They are looked up once, because Python 3.11 takes 0.3 µs each.
 _ACTIVE, _COMPLETE = MissionState.ACTIVE, MissionState.COMPLETE
-
-
-# MISSION_CURRENT repeats its values. For equal values, the cache returns the same object, which is compared faster.
-_mission_progress = lru_cache(maxsize=4)(MissionProgress)
 
 
 class PlanCache:
@@ -195,7 +191,7 @@ class PlanContext:
         return received.is_set()
 
     def _on_current(self, frame: Frame) -> None:
-        if frame.component_id == self.session.component_id:
+        if self.session.telemetry.accepts(frame):
             self._current = frame
 
     def _on_ack(self, ack: MissionAck) -> None:
@@ -333,7 +329,7 @@ class MissionTracker:
         elif reported.total is not None:
             self.count.set(reported.total, self._source)
         count = self.count.latest
-        self.progress.set(_mission_progress(current, count, reported.state), self._source)
+        self.progress.set(MissionProgress(current, count, reported.state), self._source)
         self.current.set(current, self._source)
         if current is not None and current + 1 == count:  # The current item is the last one.
             self._last_item_current_at = self._session.connection.now()
