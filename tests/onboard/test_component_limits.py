@@ -14,8 +14,9 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavFtpOpcode, MavMissionResult, MavResult
 from aerokit.missions import MissionItem
 from aerokit.onboard import CommandRequest
+from aerokit.protocols.ftp import crc32
 from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS
-from aerokit.protocols.servers.ftp_packets import FtpPacket, crc32
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 
 pytestmark = pytest.mark.anyio
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.events import DuplicateSender, RouteChanged, RouteChangeRefused
 from aerokit.mavlink.enums import MavComponent
+from aerokit.mavlink.frame import RADIO_MESSAGE_IDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
 # Maps message ids to the offset of time_boot_ms in `Frame.body`. The messages are SYSTEM_TIME, ATTITUDE,
 # ATTITUDE_QUATERNION, LOCAL_POSITION_NED and GLOBAL_POSITION_INT.
 _BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
-
-# RADIO_STATUS and RADIO. They move no route, because telemetry radios send them under their own ids, without a
-# signature, and anyone can forge them.
-_RADIO_MESSAGE_IDS = (109, 166)
 
 MIN_TAKEOVER_FRAMES = 3
 
@@ -231,7 +228,7 @@ class Routes:
 
         Returns True if the route was changed. ``is_signed`` is True if the frame is signed with our key.
         """
-        if frame.message_id in _RADIO_MESSAGE_IDS:
+        if frame.message_id in RADIO_MESSAGE_IDS:  # Anyone can forge it, so it moves no route.
             return False
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]

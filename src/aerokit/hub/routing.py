@@ -21,6 +21,7 @@ from aerokit.hub.senders import (
     Sender,
     is_autopilot,
 )
+from aerokit.mavlink.frame import RADIO_MESSAGE_IDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -37,8 +38,6 @@ MAX_PLANS = 4096
 
 _HEARTBEAT = 0
 _SETUP_SIGNING = 256
-# RADIO_STATUS and RADIO. They make and move no route, because signed endpoints accept them without a signature.
-_RADIOS = (109, 166)
 _UNKNOWN_SENDER = Sender(0, 0, -math.inf)
 
 
@@ -223,7 +222,7 @@ class Router(Generic[PortT]):
         if sender is None:
             if message_id not in self._offsets and self._targets.is_unknown(message_id):
                 return self._unknown  # The checksum of an unknown message cannot be checked, so the frame may be noise.
-            sender = self._add_sender(source, ingress, now, may_store=message_id not in _RADIOS)
+            sender = self._add_sender(source, ingress, now, may_store=message_id not in RADIO_MESSAGE_IDS)
         number, recent = ingress.number, self._recent
         if now >= recent.rotate_at or len(recent.newer) >= MAX_RECENT_FRAMES:
             recent.rotate(now)
@@ -239,7 +238,7 @@ class Router(Generic[PortT]):
                 return refusal
         if sender.port_number == number:
             sender.received_at = now
-        elif message_id not in _RADIOS:
+        elif message_id not in RADIO_MESSAGE_IDS:  # Anyone can forge these messages, so they make and move no route.
             # An autopilot has priority over other senders with its ids, so its first HEARTBEAT moves the route at once.
             must_move = message_id == _HEARTBEAT and not sender.is_autopilot and is_autopilot(body)
             self._record_at_other_port(sender, ingress, now, must_move)
@@ -394,7 +393,7 @@ class Router(Generic[PortT]):
         elif self._targets.is_command(message_id):
             numbers = [number for number in numbers if not self._is_redundant(number, sender)]
         # The radio's status is not sent to autopilots, because an autopilot adapts its message rates to any radio.
-        if message_id in _RADIOS:
+        if message_id in RADIO_MESSAGE_IDS:
             numbers = [number for number in numbers if not self._has_autopilot(number)]
         outs, rate_limited = [], []
         for number in numbers:

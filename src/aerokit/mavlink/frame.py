@@ -19,6 +19,9 @@ MAGIC_V2 = 0xFD
 SIGNED = 0x01
 """The only defined incompatibility flag: the frame has a signature of 13 bytes."""
 
+RADIO_MESSAGE_IDS = frozenset((109, 166))
+"""Ids of RADIO_STATUS and RADIO. Telemetry radios send them without a signature, because they have no key."""
+
 HEADER_LENGTH = 9  # without the magic byte
 
 SIGNATURE_LENGTH = 13

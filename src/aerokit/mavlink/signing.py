@@ -18,7 +18,7 @@ from pathlib import Path
 
 from aerokit._internal.files import write_atomically
 from aerokit.errors import FileFormatError, InvalidArgument
-from aerokit.mavlink.frame import SIGNATURE_LENGTH, SIGNED, Frame
+from aerokit.mavlink.frame import RADIO_MESSAGE_IDS, SIGNATURE_LENGTH, SIGNED, Frame
 
 KEY_LENGTH = 32
 
@@ -37,9 +37,6 @@ MAX_STREAMS = 1024
 # Maximum number of stored own signatures: those of a minute, with 270 frames a second. A replay that is older than a
 # minute is refused as too old, unless its sender is also received.
 MAX_OWN_SIGNATURES = 16_384
-
-# RADIO_STATUS (109) and RADIO (166) come from telemetry radios, which have no key.
-ALWAYS_UNSIGNED = frozenset((109, 166))
 
 _HASH_LENGTH = 6
 
@@ -303,7 +300,7 @@ class Signing:
 
     def may_be_unsigned(self, frame: Frame) -> bool:
         """Return True if a frame is accepted without a valid signature."""
-        if frame.message_id in ALWAYS_UNSIGNED:
+        if frame.message_id in RADIO_MESSAGE_IDS:
             return True
         return self.allow_unsigned is not None and bool(self.allow_unsigned(frame))
 

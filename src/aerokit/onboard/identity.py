@@ -10,7 +10,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType
 from aerokit.mavlink.enums import MavProtocolCapability as Capability
-from aerokit.protocols.servers.ftp_packets import crc32
+from aerokit.protocols.ftp import crc32
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

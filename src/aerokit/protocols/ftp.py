@@ -7,6 +7,7 @@ number again, so that no operation is executed twice. A new request gets a new n
 from __future__ import annotations
 
 import struct
+import zlib
 from typing import TYPE_CHECKING, TypeVar
 
 from aerokit._internal.values import Snapshot
@@ -28,6 +29,7 @@ __all__ = [
     "FtpMessage",
     "FtpRequest",
     "FtpSessionLost",
+    "crc32",
     "file_error",
     "path_bytes",
 ]
@@ -155,6 +157,11 @@ class FtpMessage(Snapshot):
     def errno(self) -> int | None:
         """The error number of the vehicle's operating system, if the error is FAILERRNO."""
         return self.data[1] if len(self.data) > 1 and self.data[0] == MavFtpErr.FAILERRNO else None
+
+
+def crc32(data: bytes, previous_crc: int = 0) -> int:
+    """Return the checksum of CalcFileCRC32: CRC-32 without the inversions of the start value and the result."""
+    return zlib.crc32(data, previous_crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 def path_bytes(path: str) -> bytes:

@@ -207,7 +207,7 @@ class RunningCommands:
         self._host = host
         self._server = server
         self._running: dict[int, RunningCommand] = {}
-        # By MAV_CMD and sender: the command that ended last. Entries have the order of their times.
+        # By MAV_CMD and sender: the command that ended last. Entries are ordered by `repeated_at`.
         self._ended: dict[tuple[int, ComponentIds], EndedCommand] = {}
         host.on(CommandCancel, self._on_cancel)
 

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
-from aerokit.protocols.ftp import DATA_SIZE
+from aerokit.protocols.ftp import DATA_SIZE, crc32
 from aerokit.protocols.servers.files import EFBIG, EINVAL, Entry, FileFault, FileHandle, FileSystem
-from aerokit.protocols.servers.ftp_packets import FtpPacket, Refused, checked_path, crc32
+from aerokit.protocols.servers.ftp_packets import FtpPacket, Refused, checked_path
 from aerokit.protocols.servers.host import Channel, ServerHost
 
 FilesT = TypeVar("FilesT", bound=FileSystem)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
-
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp import FtpMessage
@@ -50,11 +48,6 @@ class FtpPacket(FtpMessage):
 
 def path_in(data: bytes) -> str:
     return data.partition(b"\0")[0].decode("utf-8", "replace")
-
-
-def crc32(data: bytes, start: int = 0) -> int:
-    # CalcFileCRC32 is CRC-32 without the inversions at the start and the end.
-    return zlib.crc32(data, start ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 class Refused(Exception):

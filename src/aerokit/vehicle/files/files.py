@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,7 @@ from aerokit.errors import FileError, InvalidArgument, RemoteProtocolError, Veri
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.blocks import Reassembly
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S, OnProgress
-from aerokit.protocols.ftp import DATA_SIZE, path_bytes
+from aerokit.protocols.ftp import DATA_SIZE, crc32, path_bytes
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload, is_virtual
 from aerokit.vehicle.files.channel import FileChannel
 
@@ -29,7 +28,6 @@ __all__ = ["FileEntry", "Files"]
 CAPABILITY_FTP = 0x20
 CRC_UNSUPPORTED = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 MAX_FILE_SIZE = 0xFFFFFFFF
-CRC_INVERSION = 0xFFFFFFFF
 BLOCK_SIZE = 1 << 16
 # A directory listing counts as endless after this many consecutive replies without a new entry, or this many entries.
 MAX_REPLIES_WITHOUT_NEW_ENTRY, MAX_ENTRIES = 50, 1_000_000
@@ -366,7 +364,7 @@ class Files:
         await self._transfers.run(transfer)
 
     async def _verify(self, path: str, data: bytes, idle_timeout_s: float) -> None:
-        own_crc = _crc32(data)
+        own_crc = crc32(data)
         try:
             reply = await self._channel.request(MavFtpOpcode.CALCFILECRC, path, idle_timeout_s=idle_timeout_s)
         except FileError as error:
@@ -408,14 +406,9 @@ def _crc32_in(path: str, reply: FtpMessage) -> int:
     return int.from_bytes(reply.data[:4], "little")
 
 
-def _crc32(data: bytes, previous_crc: int = 0) -> int:
-    # Unlike zlib, MAVFTP does not invert the start value and the result.
-    return zlib.crc32(data, previous_crc ^ CRC_INVERSION) ^ CRC_INVERSION
-
-
 def _crc32_of_file(path: Path) -> int:
     crc = 0
     with path.open("rb") as disk:
         while data := disk.read(BLOCK_SIZE):
-            crc = _crc32(data, crc)
+            crc = crc32(data, crc)
     return crc

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
@@ -20,6 +19,7 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavMissionType, MavProtocolCapability
 from aerokit.missions.compare import ItemStorage, changed_items, item_differences
 from aerokit.missions.wire import PACKED_PATHS, pack_items, shift_jumps, unpack_items, with_home
+from aerokit.protocols.ftp import crc32
 from aerokit.protocols.mission_download import DownloadResult, MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload, UploadResult
 from aerokit.protocols.missions import BUSY_TIMEOUT_S, MissionClear, mission_checksum
@@ -40,7 +40,6 @@ ResultT = TypeVar("ResultT")
 REFUSAL_TEXT_DELAY_S = 0.3
 # A download reads a plan's file at most this many times, if other stations keep changing the plan.
 MAX_FILE_READS = 5
-CRC_INVERSION = 0xFFFFFFFF
 UNKNOWN_CONTENT = "whether the vehicle has the new items is unknown: call download()"
 
 
@@ -152,7 +151,7 @@ class PlanChannel:
             crc = await self._context.files().crc32(self._path, idle_timeout_s=self._options["idle_timeout_s"])
         except FileError:
             return True  # The vehicle cannot compute it.
-        return crc == zlib.crc32(data, CRC_INVERSION) ^ CRC_INVERSION  # See `Files.crc32`.
+        return crc == crc32(data)
 
     def _normalized(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
         # Fences and rally points have no autocontinue; ArduPilot returns False for them.
