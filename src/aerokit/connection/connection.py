@@ -411,6 +411,10 @@ class Connection:
         """Return how many frames of this system were received, and how many sequence numbers are missing."""
         return self._receiver.counts(system_id)
 
+    def received_from(self, system_id: int, component_id: int) -> int:
+        """Return how many frames of this sender were received over the link with the most of them."""
+        return self._receiver.received_from(system_id, component_id)
+
     def close(self, error: Exception | None = None) -> None:
         """Close the link, cancel background tasks and raise ``error`` in all waiters. Never blocks; idempotent.
 

@@ -279,6 +279,10 @@ class FrameReceiver:
         ]
         return FrameCounts(sum(source.received for source in sources), sum(source.lost for source in sources))
 
+    def received_from(self, system_id: int, component_id: int) -> int:
+        sources = [statistics.sources.get((system_id, component_id)) for statistics in self.statistics()]
+        return max((source.received for source in sources if source is not None), default=0)
+
     def _on_blocked(self, seconds: float) -> None:
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(

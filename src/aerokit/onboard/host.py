@@ -6,6 +6,7 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
+from aerokit.connection.copies import CopyFilter
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
     from aerokit.connection.bus import Detach
     from aerokit.connection.connection import Connection
-    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.protocols.servers.host import ComponentIds, Handler
 
@@ -29,11 +29,7 @@ MAX_TEXT_SIZE = 254
 """Maximum number of characters of a status text; longer texts are cut."""
 MAX_COMMAND_AGE_S = 5.0
 """Maximum age in seconds of a command that is executed. Senders give up earlier."""
-COPY_WINDOW_S = 1.0
-"""An order is a copy, made by the link, if an equal frame arrived at most this long before."""
 MAX_RECENT_ORDERS = 256
-HEARTBEAT_WINDOW_S = 2.0
-"""A HEARTBEAT of the last seconds has another sequence number than an order, unless the sender's number is constant."""
 _COMMAND_MESSAGE_IDS = (m.CommandLong.ID, m.CommandInt.ID)
 # Commands and other messages that change something. If they are older than `MAX_COMMAND_AGE_S`, they are ignored.
 # Copies are ignored, too.
@@ -68,7 +64,7 @@ class ComponentHost:
         self._encoder = None if has_ids_of_connection else FrameEncoder(system_id, component_id)
         self._started_at = connection.now()
         self._detachments: list[Detach] = []
-        self._recent_orders: dict[bytes, Frame] = {}  # by body, in the order of arrival
+        self._copies = CopyFilter(connection, MAX_RECENT_ORDERS)
         self._text_id = 0  # id of the last status text that was sent in chunks
         self._is_closed = False
 
@@ -110,25 +106,7 @@ class ComponentHost:
         # A copy must not be executed again. If it was refused because its order is running, the sender would take this
         # for the answer to the order.
         frame = message.received_frame
-        if frame is None or message.ID not in _ORDER_MESSAGE_IDS:
-            return False
-        first = self._recent_orders.pop(frame.body, frame)
-        is_recent = first is not frame and frame.received_at - first.received_at <= COPY_WINDOW_S
-        if is_recent and not self._has_constant_sequence(frame):
-            # The time of the copy is not recorded, because it would prolong the time in which others count as copies.
-            self._recent_orders[frame.body] = first
-            return True
-        self._recent_orders[frame.body] = frame
-        if len(self._recent_orders) > MAX_RECENT_ORDERS:
-            del self._recent_orders[next(iter(self._recent_orders))]
-        return False
-
-    def _has_constant_sequence(self, order: Frame) -> bool:
-        """Return True if the sender's sequence number is constant, so that its equal orders need not be copies."""
-        heartbeat = self.connection.heartbeats.get((order.system_id, order.component_id))
-        frame = None if heartbeat is None else heartbeat.received_frame
-        is_recent = frame is not None and order.received_at - frame.received_at <= HEARTBEAT_WINDOW_S
-        return is_recent and frame is not None and frame.sequence == order.sequence
+        return frame is not None and message.ID in _ORDER_MESSAGE_IDS and self._copies.is_copy(frame)
 
     def _is_late(self, message: Message) -> bool:
         """Return True for an order that may have waited too long in a blocked loop."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Awaitable
+from contextlib import nullcontext
 
 import anyio
 import pytest
@@ -243,6 +244,25 @@ async def test_copy_of_ack_does_not_acknowledge_next_command(grounded: Flight) -
         tasks.start_soon(deliver_copy)
         with pytest.raises(CommandTimeout):
             await grounded.vehicle.command(SERVO, 9, 1100)
+
+
+@pytest.mark.parametrize(("frames_between", "is_new"), [(255, True), (150, False)])
+async def test_equal_ack_after_256_frames_is_new(grounded: Flight, frames_between: int, is_new: bool) -> None:
+    """Sequence numbers repeat after 256 frames, which a fast simulation sends in less than a second."""
+    camera = FrameEncoder(1, 100)
+    sent = camera.encode(m.CommandAck(MavCmd.IMAGE_START_CAPTURE, MavResult.ACCEPTED))
+    grounded.wire.deliver(sent)
+
+    async def answer() -> None:
+        await anyio.sleep(0.1)
+        for _ in range(frames_between):
+            grounded.wire.deliver(camera.encode(m.SystemTime(0, 0)))
+        grounded.wire.deliver(sent)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(answer)
+        with nullcontext() if is_new else pytest.raises(CommandTimeout):
+            await grounded.vehicle.command(MavCmd.IMAGE_START_CAPTURE, component_id=100)
 
 
 async def test_equal_acks_of_component_with_constant_sequence_count(grounded: Flight) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections import defaultdict, deque
+from collections import defaultdict
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from aerokit.connection.copies import CopyFilter
 from aerokit.connection.exchanges import ExchangeRun
 from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed
 from aerokit.mavlink.enums import MavFrame, MavResult
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from aerokit.connection.connection import Connection
-    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.messages import CommandInt, CommandLong
     from aerokit.protocols.command import OrderStatus
 
@@ -29,12 +29,7 @@ MIN_ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
 """An ack is considered lost this many seconds after the end of the call that expected it."""
-# An ack is a copy if an equal frame arrived at most this long before. The frames have equal sequence numbers, and these
-# repeat after 256 frames, so that a new ack is equal by chance only if the vehicle sends more than 256 frames a second.
-COPY_WINDOW_S = 1.0
 MAX_RECENT_ACKS = 16
-# If a HEARTBEAT of the last seconds has the sequence number of an ack, the sender does not count its frames.
-HEARTBEAT_WINDOW_S = 2.0
 
 _Key = tuple[int, int]
 """Component id and MAV_CMD."""
@@ -96,7 +91,7 @@ class CommandSender:
         self._refused_at: dict[_Key, float] = {}
         # The last refusal of each command that arrived when no ack was expected.
         self._late_refusals: dict[_Key, _LateRefusal] = {}
-        self._recent_acks: deque[Frame] = deque(maxlen=MAX_RECENT_ACKS)
+        self._copies = CopyFilter(connection, MAX_RECENT_ACKS)
         self._is_closed = False
         self._detach_callbacks = (
             connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
@@ -327,26 +322,10 @@ class CommandSender:
         elif self._is_for_our_ids(ack):
             self._accepted_at[key] = self._connection.now()
 
-    def _is_copy(self, frame: Frame) -> bool:
-        """Record an ack's frame. Return True if an equal frame has just arrived, because the link duplicates frames."""
-        earliest = frame.received_at - COPY_WINDOW_S
-        is_equal = any(ack.body == frame.body and ack.received_at >= earliest for ack in self._recent_acks)
-        if is_equal and not self._has_constant_sequence(frame):
-            return True  # A copy is not recorded, because it would prolong the time in which others count as copies.
-        self._recent_acks.append(frame)
-        return False
-
-    def _has_constant_sequence(self, ack: Frame) -> bool:
-        """Return True if the sender's sequence number is constant, so that its equal acks need not be copies."""
-        heartbeat = self._connection.heartbeats.get((ack.system_id, ack.component_id))
-        frame = None if heartbeat is None else heartbeat.received_frame
-        is_recent = frame is not None and ack.received_at - frame.received_at <= HEARTBEAT_WINDOW_S
-        return is_recent and frame is not None and frame.sequence == ack.sequence
-
     def _on_ack(self, ack: CommandAck) -> None:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
-        if frame is not None and self._is_copy(frame):
+        if frame is not None and self._copies.is_copy(frame):
             return  # A copy could count as the ack of the next command with this MAV_CMD, even if that is lost.
         run = self._runs.get(key)
         is_final = ack.result != MavResult.IN_PROGRESS
