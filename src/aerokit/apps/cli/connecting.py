@@ -179,14 +179,15 @@ def command_action(
     """
 
     async def run(options: argparse.Namespace) -> int:
+        done, record = text.format(**vars(options)), {"action": name.format(**vars(options))}
         is_confirmed = not question or options.yes or (is_interactive() and await confirm(question))
         if not is_confirmed:
-            emit(options, "declined", {"action": name}, f"not confirmed; nothing was {text}")
+            emit(options, "declined", record, f"not confirmed; nothing was {done}")
             return FAILED
         opening = connected(options, changes_vehicle=True) if open_target is None else open_target(options)
         async with opening as target:
             await action(target, options)
-        emit(options, "done", {"action": name.format(**vars(options))}, text.format(**vars(options)))
+        emit(options, "done", record, done)
         return DONE
 
     return run
