@@ -32,6 +32,8 @@ _EARLY_MODE_CHANGE_S, _EARLY_DISARMING_S = 2.5, 0.5
 _BEFORE_ARMING_S, _AFTER_DISARMING_S = 1.0, 2.0
 # A failsafe is shown with values that were measured in this time before it.
 _BEFORE_S = 10.0
+# Of the status texts before a failsafe, the last few are shown. Texts less than _TEXT_GAP_S before it are left out.
+_TEXTS_BEFORE_S, _TEXT_GAP_S, _MAX_TEXTS = 15.0, 0.05, 4
 # A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
 _AUTOPILOT_REACTION_S = 3.0
 # The kinds of failsafes (crashes and failures) at which autopilots disarm.
@@ -219,7 +221,7 @@ def _mode_change_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> 
         # Some autopilots always change the mode after disarming. Such a change is no reaction to a failsafe.
         was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
         was_commanded = change.by_autopilot is False  # `by_autopilot` is None if the log does not contain the cause
-        previous_mode = flight.mode_at(change.time_s - 1e-6)
+        previous_mode = flight.mode_at(change.time_s - 1e-6)  # just before the change
         if is_near and was_armed and not was_commanded and previous_mode:
             # If the log lacks the cause, an early change counts as the autopilot's. A later one may be the pilot's.
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
@@ -432,5 +434,5 @@ def failsafe_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:
-    texts = [text for text in flight.texts if time_s - 15 <= text.time_s < time_s - 0.05]
-    return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-4:]]
+    texts = [text for text in flight.texts if time_s - _TEXTS_BEFORE_S <= text.time_s < time_s - _TEXT_GAP_S]
+    return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-_MAX_TEXTS:]]

@@ -328,7 +328,7 @@ def _fence_traces(flight: FlightLog) -> list[dict[str, Any]]:
         radius = parameter_at("FENCE_RADIUS", end_s)
     if not 0 < radius < _MAX_FENCE_M:
         return []
-    angles = [math.tau * number / 90 for number in range(91)]
+    angles = [math.tau * number / 90 for number in range(91)]  # a polygon with 90 sides
     return [
         {
             "x": [round(radius * math.sin(angle), 1) for angle in angles],

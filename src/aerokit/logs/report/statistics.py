@@ -432,11 +432,11 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 def _failsafes_sentence(flight: FlightLog) -> str:
     acted, warnings, warning_kinds = [], [], []
     for failsafe in failsafes(flight):
-        at = f"{failsafe.title} at {clock_text(failsafe.time_s)}"
+        title_and_time = f"{failsafe.title} at {clock_text(failsafe.time_s)}"
         if failsafe.acted:
-            acted.append(f"{at} ({failsafe.reaction})")
+            acted.append(f"{title_and_time} ({failsafe.reaction})")
         else:
-            warnings.append(f"{at} ({failsafe.evidence[0].text})")
+            warnings.append(f"{title_and_time} ({failsafe.evidence[0].text})")
             warning_kinds.append(failsafe.kind)
     sentences = []
     if acted:
