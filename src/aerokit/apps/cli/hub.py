@@ -65,11 +65,11 @@ def _parse_filter(text: str) -> tuple[str, tuple[str, ...]]:
 
     Without ``@ENDPOINT``, which means all endpoints, the name is "".
     """
-    names, at, endpoint = text.partition("@")
+    names, separator, endpoint = text.partition("@")
     patterns = tuple(name.strip() for name in names.split(",") if name.strip())
     if not patterns:
         raise argparse.ArgumentTypeError(f"{text!r} has no message name; expected {_FILTER_EXAMPLE}")
-    if at and not endpoint:
+    if separator and not endpoint:
         raise argparse.ArgumentTypeError(f"{text!r} has no endpoint after the @; expected {_FILTER_EXAMPLE}")
     return endpoint, patterns
 

@@ -175,7 +175,8 @@ async def _set(options: argparse.Namespace) -> int:
         }
     code = _emit_results(options, results.values(), known_names, metadata)
     has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
-    if has_changed and metadata is None and not (options.force or options.json):
+    is_unchecked = metadata is None and not options.force
+    if has_changed and is_unchecked and not options.json:
         print(ranges_unchecked_text(vehicle))
     return code
 
@@ -205,7 +206,8 @@ async def _load(options: argparse.Namespace) -> int:
     failed_count = sum(result.error is not None for result in changed)
     not_set = f", {failed_count} were not set" if failed_count else ""
     print(f"{len(results)} parameters in {options.file}, {len(changed) - failed_count} of them differed{not_set}")
-    if len(changed) > failed_count and metadata is None and not options.force:
+    is_unchecked = metadata is None and not options.force
+    if len(changed) > failed_count and is_unchecked:
         print(ranges_unchecked_text(vehicle))
     return code
 
