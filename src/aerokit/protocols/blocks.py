@@ -56,7 +56,7 @@ class CongestionWindow:
 
     def on_answer(self, round_trip_s: float | None) -> None:
         """Record an answer. ``round_trip_s`` is the time since its request, or None if it must not be measured."""
-        # This moves the average towards 0, as each loss moves it towards 1.
+        # An answer moves the average towards 0, a loss towards 1.
         self._average_loss -= LOSS_WEIGHT * self._average_loss
         if round_trip_s is None:
             return

@@ -94,8 +94,8 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
         is_streamed = self._is_streaming and index >= self._next_index
         if is_streamed:
-            for missing in range(self._next_index, index):
-                self._window.request(missing)
+            for missing_index in range(self._next_index, index):
+                self._window.request(missing_index)
             if self._next_index:  # The time before the first value is not a pause of the stream.
                 self._pause_s = max(self._pause_s, now - self._last_at)
             self._next_index = index + 1

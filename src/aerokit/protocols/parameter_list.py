@@ -167,8 +167,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._must_request_missing = True
 
     def _on_streamed_value(self, index: int, now: float) -> None:
-        for missing in range(self._next_index, min(index, self._count or 0)):
-            self._window.request(missing)
+        for missing_index in range(self._next_index, min(index, self._count or 0)):
+            self._window.request(missing_index)
         if self._streamed_count:
             self._pause_s = max(now - self._last_at, PAUSE_DECAY * self._pause_s)
         self._next_index = index + 1
