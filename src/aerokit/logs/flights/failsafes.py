@@ -323,8 +323,8 @@ def _gps_context(flight: FlightLog, time_s: float) -> list[str]:
             (fix_type, "fix type {:.0f}"),
             (gps.at("hdop", time_s), "HDOP {:.1f}"),
         )
-        known = [template.format(value) for value, template in values if not math.isnan(value)]
-        text = f"receiver {number + 1}: {', '.join(known)}"
+        known_texts = [template.format(value) for value, template in values if not math.isnan(value)]
+        text = f"receiver {number + 1}: {', '.join(known_texts)}"
         earlier_satellites = gps.at("satellites", time_s - _BEFORE_S)
         if not math.isnan(earlier_satellites):
             text += f"; {earlier_satellites:.0f} satellites {_BEFORE_S:.0f} s before"
@@ -409,8 +409,8 @@ def _max_before(series: TimeSeries, name: str, time_s: float) -> float | None:
 
 def _limit_parameters(flight: FlightLog, kind: str, time_s: float) -> list[str]:
     values = ((name, flight.parameter_at(name, time_s)) for name in failsafe_parameters(flight, kind))
-    known = [_parameter_text(flight, name, value) for name, value in values if not math.isnan(value)]
-    return [f"parameters: {', '.join(known)}"] if known else []
+    known_texts = [_parameter_text(flight, name, value) for name, value in values if not math.isnan(value)]
+    return [f"parameters: {', '.join(known_texts)}"] if known_texts else []
 
 
 def _parameter_text(flight: FlightLog, name: str, value: float) -> str:

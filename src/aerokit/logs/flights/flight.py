@@ -58,9 +58,9 @@ class TimeSeries:
     def extend(self, times: Sequence[float], **columns: Sequence[float]) -> None:
         """Add many rows. Columns without values become NaN."""
         self.times.extend(times)
-        missing = array("d", [_NAN]) * len(times)
+        unknown_values = array("d", [_NAN]) * len(times)
         for name, column in self._values.items():
-            column.extend(columns.get(name, missing))
+            column.extend(columns.get(name, unknown_values))
 
     def has_values(self, *names: str) -> bool:
         """Return True if one of these columns has a known value. Without names, all columns are searched."""
@@ -86,8 +86,8 @@ class TimeSeries:
 
     def between(self, name: str, start_s: float, end_s: float) -> array[float]:
         """Return the values of a column in a time span, both ends included, without NaN."""
-        part = self._values[name][bisect_left(self.times, start_s) : self.index_at(end_s) + 1]
-        return array("d", (value for value in part if value == value))  # False for NaN
+        values = self._values[name][bisect_left(self.times, start_s) : self.index_at(end_s) + 1]
+        return array("d", (value for value in values if value == value))  # False for NaN
 
 
 class TangentPlane:

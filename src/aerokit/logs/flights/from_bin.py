@@ -224,9 +224,9 @@ class _Reader:
             self._read_air, self._read_batteries, self._read_gps, self._read_vibration, self._read_estimator,
             self._read_radio, self._read_errors,
         )  # fmt: skip
-        for done, step in enumerate(steps, 1):
+        for steps_done, step in enumerate(steps, 1):
             step()
-            on_share(done / len(steps))
+            on_share(steps_done / len(steps))
         all_series = (flight.track, flight.attitude, flight.vibration, *flight.batteries.values())
         ends = [series.times[-1] for series in all_series if len(series)]
         if flight.texts:

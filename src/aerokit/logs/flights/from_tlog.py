@@ -378,9 +378,9 @@ class _Reader:
     def _on_version(self, time_s: float, message: m.AutopilotVersion) -> None:
         self._capabilities = message.capabilities
         number = message.flight_sw_version
-        if number:
-            parts = ".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8))
-            self._flight.vehicle = f"{self._autopilot.firmware} {parts}"
+        if number:  # The bytes are major, minor, patch and type.
+            version = ".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8))
+            self._flight.vehicle = f"{self._autopilot.firmware} {version}"
 
     def _on_home(self, time_s: float, message: m.HomePosition) -> None:
         self._flight.set_home(time_s, message.latitude / _E7, message.longitude / _E7, message.altitude / 1e3)

@@ -435,6 +435,7 @@ def _version(log: Any) -> str:
     release = log.msg_info_dict.get("ver_sw_release")
     if not isinstance(release, int) or not release:
         return Px4.name
+    # The bytes are major, minor, patch and type.
     return f"{Px4.name} {release >> 24 & 0xFF}.{release >> 16 & 0xFF}.{release >> 8 & 0xFF}"
 
 

@@ -148,7 +148,7 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
         min_satellites=min(satellites, default=None),
         max_hdop=_max_or_none(hdops),
         max_vibration_m_s2=_max_or_none(vibrations),
-        clips=sum(max(after - before, 0.0) for before, after in pairwise(clips)) if clips else None,
+        clips=sum(max(later - earlier, 0.0) for earlier, later in pairwise(clips)) if clips else None,
         max_estimator_ratio=_max_or_none(estimator_ratios),
         lost_percent=spans.mean(flight.link, "lost_percent"),
     )
