@@ -396,8 +396,8 @@ def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
     items: Iterable[MissionItem] = [_item_of(command, index) for index, command in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
         # For ArduPilot, coordinates 0, 0 mean the current position. Other autopilots need the actual coordinates.
-        here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
-        items = convert_from_ardupilot(items, None if here is None else (here.latitude_deg, here.longitude_deg))
+        place = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
+        items = convert_from_ardupilot(items, None if place is None else (place.latitude_deg, place.longitude_deg))
     return Mission(shift_jumps(items, -1))
 
 

@@ -69,11 +69,11 @@ class FlightMethods(VehicleAttributes):
 
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects the mode.
         """
-        found = self._dk_find_mode(mode)
-        order = self._dk_set_mode(found)
+        target_mode = self._dk_find_mode(mode)
+        order = self._dk_set_mode(target_mode)
 
         def is_done() -> bool:
-            return self._flightmode == found.name and not self._dk_is_heartbeat_old
+            return self._flightmode == target_mode.name and not self._dk_is_heartbeat_old
 
         self._dk_wait_for_order(order, is_done, timeout, "failed to set flight mode")
 
