@@ -76,14 +76,14 @@ def _parse_filter(text: str) -> tuple[str, tuple[str, ...]]:
 
 def _parse_rates(text: str) -> tuple[str, dict[str, float]]:
     """Parse ``MESSAGE=HZ,…[@ENDPOINT]`` into the endpoint ("" for all) and the rate of each message."""
-    endpoint, parts = _parse_filter(text)
+    endpoint, rate_texts = _parse_filter(text)
     rates = {}
-    for part in parts:
-        name, _, hz = part.partition("=")
+    for rate_text in rate_texts:
+        name, _, hz = rate_text.partition("=")
         try:
             rates[name] = float(hz)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{part!r} is not a rate; expected ATTITUDE=5 (in Hz)") from None
+            raise argparse.ArgumentTypeError(f"{rate_text!r} is not a rate; expected ATTITUDE=5 (in Hz)") from None
     return endpoint, rates
 
 

@@ -185,8 +185,10 @@ class MqttLink(BaseLink):
         while self._client is not None and self._unsent and not client.want_write():
             name = next(iter(self._unsent))
             client.publish(self._broker.key_space.state(name), self._unsent.pop(name))
-        if self._client is not None and client.want_write() and (sock := client.socket()):
-            asyncio.get_running_loop().add_writer(sock, self._continue_writing, client, sock)
+        if self._client is not None and client.want_write():
+            sock = client.socket()
+            if sock:
+                asyncio.get_running_loop().add_writer(sock, self._continue_writing, client, sock)
 
     def _continue_writing(self, client: Any, sock: Any) -> None:
         client.loop_write()
