@@ -393,7 +393,7 @@ class _DeliveryQueue:
         due, _, _ = self._waiting[0]
         if self._timer is not None:
             if self._timer_at <= due:
-                return
+                return  # The timer is early enough.
             self._timer.cancel()
         self._timer = self.loop.call_at(due, self._run)
         self._timer_at = due
