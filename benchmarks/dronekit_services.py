@@ -51,7 +51,7 @@ GROUPS = ("ATC", "BATT", "EK3", "INS", "RC", "SERVO", "PSC", "WPNAV")
 
 def parameter_names(count: int) -> list[str]:
     """Return parameter names with the typical length of ArduPilot's, in the order of their indices."""
-    return [f"{GROUPS[n % len(GROUPS)]}_BENCH{n}" for n in range(count)]
+    return [f"{GROUPS[number % len(GROUPS)]}_BENCH{number}" for number in range(count)]
 
 
 class Services:
