@@ -43,7 +43,9 @@ RECORDINGS = _recordings()
 """Recordings by name: the complete flights if they are available, and the short ones in the repository. Frames of PX4
 are signed, with or without a key.
 """
+# Both ids of the sender are one field. The message id has 3 bytes, so the last field also has the payload's first byte.
 _HEADER = Struct("<BBBxBHI").unpack_from
+HEADER_SIZE = 10
 _CHECKSUM = Struct("<H").unpack_from
 _IS_COMPILED = wire_implementation == "c"
 SKIP_AIM = 50.0 if _IS_COMPILED else 10.0
@@ -150,7 +152,7 @@ def _check_only(chunks: list[bytes]) -> int:
     valid = 0
     for chunk in chunks:
         _, length, _, _, _, message_id = _HEADER(chunk)
-        end = 10 + length
+        end = HEADER_SIZE + length
         (checksum,) = _CHECKSUM(chunk, end)
         if x25(chunk[1:end] + extras[message_id & 0xFFFFFF]) == checksum:
             valid += 1
@@ -163,21 +165,21 @@ def _check_and_unpack(chunks: list[bytes]) -> int:
     for chunk in chunks:
         _, length, _, _, _, message_id = _HEADER(chunk)
         message_id &= 0xFFFFFF
-        end = 10 + length
-        body = chunk[1:end]
+        end = HEADER_SIZE + length
+        body = chunk[1:end]  # without the magic byte
         (checksum,) = _CHECKSUM(chunk, end)
         if x25(body + extras[message_id]) == checksum:
             unpack, size = _payload(message_id)
-            unpack(body.ljust(size, b"\0"), 9)
+            unpack(body.ljust(size, b"\0"), HEADER_SIZE - 1)
             valid += 1
     return valid
 
 
 @cache
 def _payload(message_id: int) -> tuple[Callable[[bytes, int], tuple[Any, ...]], int]:
-    """Return the unpacker of all fields of a message, and the required lengths of header and payload."""
+    """Return the unpacker of all fields of a message, and the required length of the body."""
     fields = ardupilotmega.mavlink_map[message_id].unpacker
-    return fields.unpack_from, 9 + fields.size
+    return fields.unpack_from, HEADER_SIZE - 1 + fields.size
 
 
 def _pymavlink(chunks: list[bytes]) -> int:

@@ -68,12 +68,12 @@ async def _in_turns(
     rounds: int,
 ) -> tuple[float, float]:
     """Return the median rates of aerokit and of pymavlink."""
-    own = []
-    peer = []
+    own_rates = []
+    peer_rates = []
     for _ in range(rounds):
-        own.append(await measure(frames, pieces))
-        peer.append(_pymavlink(len(frames), pieces))
-    return statistics.median(own), statistics.median(peer)
+        own_rates.append(await measure(frames, pieces))
+        peer_rates.append(_pymavlink(len(frames), pieces))
+    return statistics.median(own_rates), statistics.median(peer_rates)
 
 
 async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:

@@ -51,7 +51,7 @@ GROUPS = ("ATC", "BATT", "EK3", "INS", "RC", "SERVO", "PSC", "WPNAV")
 
 def parameter_names(count: int) -> list[str]:
     """Return parameter names with the typical length of ArduPilot's, in the order of their indices."""
-    return [f"{GROUPS[n % len(GROUPS)]}_BENCH{n}" for n in range(count)]
+    return [f"{GROUPS[number % len(GROUPS)]}_BENCH{number}" for number in range(count)]
 
 
 class Services:
@@ -223,13 +223,14 @@ def _packed_parameters(parameters: list[tuple[str, float]], *, with_defaults: bo
     file = bytearray(struct.pack("<HHH", magic, count, count))
     previous_name = ""
     for name, value in parameters:
-        shared = 0
-        while shared < min(len(name), len(previous_name), 15) and name[shared] == previous_name[shared]:
-            shared += 1
-        rest = name[shared:].encode()
-        lengths = (len(rest) - 1) << 4 | shared
+        shared_length = 0
+        max_shared_length = min(len(name), len(previous_name), 15)  # 15 because both lengths have four bits each.
+        while shared_length < max_shared_length and name[shared_length] == previous_name[shared_length]:
+            shared_length += 1
+        suffix = name[shared_length:].encode()
+        lengths = (len(suffix) - 1) << 4 | shared_length
         packed_value = struct.pack("<f", value)
-        entry = bytes([PACKED_FLOAT, lengths]) + rest + packed_value
+        entry = bytes([PACKED_FLOAT, lengths]) + suffix + packed_value
         bytes_in_next_block = (len(file) + len(entry)) % DATA_SIZE
         if 0 < bytes_in_next_block < len(packed_value):
             file += bytes(len(packed_value) - bytes_in_next_block)

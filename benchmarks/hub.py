@@ -195,8 +195,9 @@ def _recorded_frames(count: int) -> list[bytes]:
     """Return broadcast frames of a recorded copter. The recording is repeated with continuous sequence numbers."""
     path = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
     targets = TargetFields(STANDARD)
-    frames = [Frame.parse(raw) for _, raw in read_tlog(path) if raw[0] == MAGIC_V2 and raw[5:7] == b"\1\1"]
-    broadcast = [frame for frame in frames if targets.target_of(frame) == (0, 0)]
+    frames = [Frame.parse(raw) for _, raw in read_tlog(path) if raw[0] == MAGIC_V2]
+    of_copter = [frame for frame in frames if (frame.system_id, frame.component_id) == (1, 1)]
+    broadcast = [frame for frame in of_copter if targets.target_of(frame) == (0, 0)]
     # The body of a frame is without its magic byte: length, flags, 1 byte, sequence number, …
     unsigned = [frame for frame in broadcast if frame.body[1] == 0]
     numbered = []
@@ -222,7 +223,7 @@ def _count_received(receivers: list[socket.socket], counts: list[int]) -> None:
                 payload_length = data[begin + 1]
                 if magic == MAGIC_V2 and data[begin + 5] == 1:  # the system id
                     counts[index] += 1
-                begin += payload_length + (12 if magic == MAGIC_V2 else 8)
+                begin += payload_length + (12 if magic == MAGIC_V2 else 8)  # with header and checksum
 
 
 # --------------------------------------------------------------------------------------------- latency

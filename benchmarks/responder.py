@@ -89,7 +89,7 @@ class Responder:
         if peer is None:
             return
         param1, command = COMMAND_FIELDS.unpack_from(data, HEADER_SIZE)
-        system_id, component_id = data[5], data[6]
+        system_id, component_id = data[5], data[6]  # of the sender
         make_ack = partial(
             messages.CommandAck,
             command=command,

@@ -31,12 +31,12 @@ async def main(address: str) -> None:
 
 async def print_missing(vehicle: aerokit.Vehicle) -> None:
     """Print the missing requirements for a flight whenever they change."""
-    before: list[str] = []
+    previous: list[str] = []
     while True:
         missing = vehicle.missing_for_flight()
-        if missing != before:
+        if missing != previous:
             print(f"still missing: {'; '.join(missing) or 'nothing'}")
-        before = missing
+        previous = missing
         await asyncio.sleep(0.5)
 
 

@@ -33,17 +33,17 @@ def main() -> None:
     deadline = time.monotonic() + TIMEOUT_S
     while vehicle.channels["1"] is None and time.monotonic() < deadline:
         time.sleep(POLL_S)
-    before = dict(vehicle.channels)
-    print("channels:", before)
+    initial_channels = dict(vehicle.channels)
+    print("channels:", initial_channels)
 
     vehicle.channels.overrides["3"] = 1100
     wait_for_channels(vehicle, {"3": 1100})
     vehicle.channels.overrides = {"1": 1600, "2": 1400}
     print("overrides:", vehicle.channels.overrides)
-    wait_for_channels(vehicle, {"1": 1600, "2": 1400, "3": before["3"]})
+    wait_for_channels(vehicle, {"1": 1600, "2": 1400, "3": initial_channels["3"]})
     del vehicle.channels.overrides["1"]
     vehicle.channels.overrides["2"] = None
-    wait_for_channels(vehicle, {"1": before["1"], "2": before["2"]})
+    wait_for_channels(vehicle, {"1": initial_channels["1"], "2": initial_channels["2"]})
     vehicle.channels.overrides = {}
     vehicle.close()
 

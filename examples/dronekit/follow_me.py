@@ -26,10 +26,10 @@ def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> floa
 
 def walker(start: LocationGlobalRelative, speed: float) -> Locator:
     """Return a function that returns the position of a walker, who walks north at ``speed`` m/s."""
-    started = time.monotonic()
+    started_at = time.monotonic()
 
     def locate() -> LocationGlobalRelative:
-        walked = speed * (time.monotonic() - started)
+        walked = speed * (time.monotonic() - started_at)
         return LocationGlobalRelative(start.lat + walked / METRES_PER_DEGREE, start.lon, 0)
 
     return locate

@@ -30,6 +30,7 @@ def fly(vehicle: Vehicle, north: float, east: float, down: float, seconds: float
 
 def turn(vehicle: Vehicle, heading: float, timeout: float = 20.0) -> None:
     """Turn to a heading in degrees and wait for it."""
+    # With param4 = 0, param1 is a compass heading and not an angle relative to the present one.
     message = vehicle.message_factory.command_long_encode(
         target_system=0, target_component=0, command=mavutil.mavlink.MAV_CMD_CONDITION_YAW, confirmation=0,
         param1=heading, param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,

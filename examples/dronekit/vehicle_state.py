@@ -55,10 +55,10 @@ def listen(vehicle: Vehicle, seconds: float) -> None:
 
 
 def change_parameter(vehicle: Vehicle, name: str) -> None:
-    before = vehicle.parameters[name]
-    vehicle.parameters[name] = before + 1
-    print(f"{name} was {before}, is {vehicle.parameters[name]}")
-    vehicle.parameters[name] = before
+    old_value = vehicle.parameters[name]
+    vehicle.parameters[name] = old_value + 1
+    print(f"{name} was {old_value}, is {vehicle.parameters[name]}")
+    vehicle.parameters[name] = old_value
 
 
 def main() -> None:

@@ -98,7 +98,8 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
         is_missing_position = text.startswith(("the estimator has no ", "no GPS receiver has "))
         # If only the report of an estimate is missing, the vehicle itself may have the estimate and arm.
         is_missing_report = text.startswith(("estimator (", "position (", "home (")) and text.endswith(" not received)")
-        if (needs_position or not is_missing_position) and not is_missing_report:
+        arms_without_position = is_missing_position and not needs_position
+        if not arms_without_position and not is_missing_report:
             needed.append(text)
     return needed
 
@@ -123,7 +124,8 @@ def arm_refusals(vehicle: Vehicle, missing: list[str]) -> list[str]:
     # An empty `modes_without_position` means that it is unknown which modes of this autopilot need a position.
     needs_position = bool(autopilot.modes_without_position) and arms_in not in autopilot.modes_without_position
     estimator = vehicle.estimator.latest
-    if arms_in is not None and needs_position and estimator is not None and estimator.missing:
+    lacks_estimates = estimator is not None and bool(estimator.missing)
+    if arms_in is not None and needs_position and lacks_estimates:
         change = "" if unarmable is None else ", to which arming would change the mode"
         headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
         # A value that was not received is not named as a reason, because the vehicle itself may have it.

@@ -226,7 +226,8 @@ class VehicleAttributes(VehicleCore):
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         # Like DroneKit, require any fix (2D or better) and a predicted position of the estimator.
         gps = self._dk_gps.message
-        return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & EkfFlags.PRED_POS_HORIZ_ABS)
+        has_fix = gps is not None and gps.fix_type > 1
+        return has_fix and bool((self._dk_ekf_flags or 0) & EkfFlags.PRED_POS_HORIZ_ABS)
 
     @property
     def version(self) -> Version:

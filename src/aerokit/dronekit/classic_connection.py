@@ -320,5 +320,5 @@ class OverrideRelease:
 
 def _release_value(channel: int, is_overridden: bool) -> int:
     if channel > MAVLINK_1_CHANNELS:
-        return RELEASE_UPPER if is_overridden else 0
+        return RELEASE_UPPER if is_overridden else 0  # 0 leaves the channel unchanged.
     return RELEASE if is_overridden else IGNORE

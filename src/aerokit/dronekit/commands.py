@@ -296,7 +296,7 @@ class CommandSequence:
         own_ids = connection.source_system, connection.source_component
         home_command, *items = _commands_of(mission, own_ids)
         with self._lock:
-            if number != self._download_number:
+            if number != self._download_number:  # A newer download has started.
                 return
             self._state = SequenceState(tuple(items), home_command)
             self._vehicle_content = _content_of(items)
@@ -377,7 +377,9 @@ def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
         return False
     if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):
         return False
-    return cmd.current == 1 or not any((cmd.x, cmd.y, cmd.z)) or _is_at_home(cmd, home)
+    is_marked = cmd.current == 1
+    is_unknown_home = not any((cmd.x, cmd.y, cmd.z))
+    return is_marked or is_unknown_home or _is_at_home(cmd, home)
 
 
 def _is_at_home(cmd: Command, home: LocationGlobal | None) -> bool:
@@ -394,8 +396,8 @@ def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
     items: Iterable[MissionItem] = [_item_of(command, index) for index, command in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
         # For ArduPilot, coordinates 0, 0 mean the current position. Other autopilots need the actual coordinates.
-        here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
-        items = convert_from_ardupilot(items, None if here is None else (here.latitude_deg, here.longitude_deg))
+        place = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
+        items = convert_from_ardupilot(items, None if place is None else (place.latitude_deg, place.longitude_deg))
     return Mission(shift_jumps(items, -1))
 
 

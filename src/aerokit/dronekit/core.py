@@ -50,7 +50,7 @@ class Readiness:
 
     def mark(self, name: str) -> None:
         if name in self.names and name not in self._failures:
-            return
+            return  # Nothing changes.
         with self._lock:
             self._failures.pop(name, None)
             self.names.add(name)

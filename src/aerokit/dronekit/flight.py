@@ -69,11 +69,11 @@ class FlightMethods(VehicleAttributes):
 
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects the mode.
         """
-        found = self._dk_find_mode(mode)
-        order = self._dk_set_mode(found)
+        target_mode = self._dk_find_mode(mode)
+        order = self._dk_set_mode(target_mode)
 
         def is_done() -> bool:
-            return self._flightmode == found.name and not self._dk_is_heartbeat_old
+            return self._flightmode == target_mode.name and not self._dk_is_heartbeat_old
 
         self._dk_wait_for_order(order, is_done, timeout, "failed to set flight mode")
 
@@ -253,7 +253,8 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_change_speed(self, name: str, kind: int, speed: float) -> None:
         flight_orders.check_speed(name, speed)
-        self._dk.command(name, MavCmd.DO_CHANGE_SPEED, kind, float(speed), -1)
+        unchanged_throttle = -1
+        self._dk.command(name, MavCmd.DO_CHANGE_SPEED, kind, float(speed), unchanged_throttle)
 
     # ---------------------------------------------------------------------------------- home
 
@@ -277,15 +278,18 @@ class FlightMethods(VehicleAttributes):
         target = flight_orders.checked_location(pos)
         aio = self._dk.check_link()
         home = {"frame": MavFrame.GLOBAL, "x": target.latitude_e7, "y": target.longitude_e7, "z": target.altitude_m}
-        order = self._dk.order("home", aio.command_int, MavCmd.DO_SET_HOME, 0, **home, component_id=0, or_long=True)
+        use_given_place = 0  # Param 1 of DO_SET_HOME is 1 for the current position of the vehicle.
+        order = self._dk.order(
+            "home", aio.command_int, MavCmd.DO_SET_HOME, use_given_place, **home, component_id=0, or_long=True
+        )
         self._home_location = LocationGlobal(pos.lat, pos.lon, target.altitude_m)
         order.add_done_callback(functools.partial(self._dk_on_home_answer, self._home_location))
 
-    def _dk_on_home_answer(self, new: LocationGlobal, order: Future[None]) -> None:
+    def _dk_on_home_answer(self, new_home: LocationGlobal, order: Future[None]) -> None:
         """Confirm the new home if the vehicle has accepted it; restore the old one on a rejection or a time-out."""
         error = order.exception()
         if error is None:
-            self._dk_confirmed_home = new
+            self._dk_confirmed_home = new_home
         elif isinstance(error, (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_confirmed_home
 
@@ -338,18 +342,18 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_altitude_condition(self, alt: float, epsilon: float, *, is_relative: bool) -> Callable[[], bool]:
         """Return a condition that is true if the altitude is near ``alt``, or has passed it since the first call."""
-        start: float | None = None
+        first_altitude: float | None = None
 
         def has_reached() -> bool:
-            nonlocal start
+            nonlocal first_altitude
             location = self.location
             frame = location.global_relative_frame if is_relative else location.global_frame
             altitude: float | None = frame.alt
             if altitude is None:
                 return False
-            if start is None:
-                start = altitude
-            has_passed = start < alt <= altitude or altitude <= alt < start  # on the way up, or down
+            if first_altitude is None:
+                first_altitude = altitude
+            has_passed = first_altitude < alt <= altitude or altitude <= alt < first_altitude  # on the way up, or down
             return abs(altitude - alt) <= epsilon or has_passed
 
         return has_reached

@@ -300,7 +300,8 @@ class Maintenance(VehicleCore):
 
     # -------------------------------------------------------------------------- calibrations
 
-    # PREFLIGHT_CALIBRATION has one parameter each for gyroscopes, compasses, pressure, radio and accelerometers.
+    # PREFLIGHT_CALIBRATION has one parameter each for gyroscopes, compasses, pressure, radio and accelerometers. The
+    # last one is 1 for six poses, 2 for the level attitude, and 4 for the level pose only.
 
     def send_calibrate_gyro(self) -> None:
         """Calibrate the gyroscopes: keep the vehicle still."""

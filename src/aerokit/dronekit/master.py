@@ -289,8 +289,10 @@ class Inbox(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         self._start()
         message_id = _id_of(name)
-        while (frame := self._latest.get(message_id)) is None and self._may_wait():
+        frame = self._latest.get(message_id)
+        while frame is None and self._may_wait():
             self._arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # short, so that `_may_wait` ends the loop in time
+            frame = self._latest.get(message_id)
         if frame is None:
             raise KeyError(name)
         return message_of(frame)

@@ -268,7 +268,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         Unlike in a dict, the second argument is ``wait_ready``, not the default. With ``wait_ready`` false, nothing is
         requested: the result is the value if it is already known, otherwise ``default``.
         """
-        if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
+        value = self._values.get(name.upper()) if isinstance(name, str) else None
+        if value is not None:
             return value
         resolved = self._find(name, waits=bool(wait_ready))
         if resolved is None:
@@ -356,9 +357,11 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         name = name.upper()
         has_all = self._has_all_values  # Read before `find`, because the last value may arrive during `find`.
         resolved = self._values.find(name)
-        if resolved is None and waits and not has_all and _is_valid_name(name):
-            self._core.run(self._wait_for, name)
-            resolved = self._values.find(name)
+        if resolved is None and waits:
+            may_exist = not has_all and _is_valid_name(name)
+            if may_exist:
+                self._core.run(self._wait_for, name)
+                resolved = self._values.find(name)
         return resolved
 
     @property

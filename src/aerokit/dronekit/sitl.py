@@ -195,7 +195,7 @@ class SITL:
         return self._address().replace("tcpin:", "tcp:")
 
     def _address(self) -> str:
-        return f"tcpin:127.0.0.1:{5760 + 10 * self.instance}"
+        return f"tcpin:127.0.0.1:{5760 + 10 * self.instance}"  # the port of SITL with `-I INSTANCE`
 
 
 def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
@@ -203,8 +203,9 @@ def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
     if (lat is None) != (lon is None):
         raise InvalidArgument("dronekit_sitl.start_default needs either both lat and lon or neither")
     sitl = SITL()
+    _, _, altitude_amsl_m = HOME
     heading_deg = 353  # The format of SITL's --home requires a heading, which is ignored.
-    sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},{heading_deg}"])
+    sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{altitude_amsl_m},{heading_deg}"])
     return sitl
 
 

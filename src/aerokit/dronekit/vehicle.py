@@ -81,7 +81,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._dk_sync: sync.Vehicle | None = None
         self._dk_initializing = threading.Lock()
         self._message_listeners = MessageListeners(self, handler)
-        self._channels = Channels(self, 8)
+        self._channels = Channels(self, count=8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
         self._dk.ready.mark("commands")  # Until download() is called, an empty mission is a valid value of `commands`.

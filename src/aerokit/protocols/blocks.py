@@ -56,7 +56,7 @@ class CongestionWindow:
 
     def on_answer(self, round_trip_s: float | None) -> None:
         """Record an answer. ``round_trip_s`` is the time since its request, or None if it must not be measured."""
-        # This moves the average towards 0, as each loss moves it towards 1.
+        # An answer moves the average towards 0, a loss towards 1.
         self._average_loss -= LOSS_WEIGHT * self._average_loss
         if round_trip_s is None:
             return
@@ -112,7 +112,7 @@ class BlockRequests(PendingRequests[int]):
         """Record an answer. ``sent_at`` is the time of the transmission that it answers, if known."""
         block = self._requests.get(offset)
         self.discard(offset)
-        if block is None:
+        if block is None:  # It was not requested, or is already answered.
             return
         if sent_at is None:
             sent_at = self._sent_at_of_answer(block, now)
@@ -148,8 +148,8 @@ class BlockRequests(PendingRequests[int]):
         due: list[int] = []
         self._must_wait_to_send = False
         while self._waiting and len(self._in_flight) < size:
-            is_batch_sent = len(self._in_flight) >= self._batch_size
-            if is_batch_sent:  # Further requests are sent one by one, with pauses.
+            is_batch_in_flight = len(self._in_flight) >= self._batch_size
+            if is_batch_in_flight:  # Further requests are sent one by one, with pauses.
                 if now < self._next_send_at:
                     self._must_wait_to_send = True
                     break

@@ -263,7 +263,7 @@ class CommandExchange(Exchange[CommandAck]):
     def start(self, now: float) -> None:
         self._started_at = now
         self._send(now)
-        if self._sent_by_caller:
+        if self._sent_by_caller:  # `_send` has counted the transmission; the message itself must not be sent twice.
             self._outbox.clear()
 
     def receive(self, message: Message, now: float) -> None:

@@ -342,7 +342,7 @@ class Transfer(Exchange[ResultT]):
 
     def _wait_until(self, *times: float | None) -> None:
         """Set the deadline to the earliest of these times, but not later than the idle time-out."""
-        self.deadline: float | None = min(at for at in (*times, self._idle_deadline) if at is not None)
+        self.deadline: float | None = min(time for time in (*times, self._idle_deadline) if time is not None)
 
     def _is_idle(self, now: float) -> bool:
         return now >= self._idle_deadline

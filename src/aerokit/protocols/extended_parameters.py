@@ -12,8 +12,8 @@ from aerokit.protocols.exchange import StaleAnswerFilter, Transfer
 from aerokit.protocols.named_values import (
     BY_NAME,
     MIN_START_TIMEOUT_S,
-    PAUSES,
     PROBE,
+    TIMEOUT_PAUSES,
     NamedReads,
     RepeatedAnswers,
     ValueList,
@@ -94,13 +94,13 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
         is_streamed = self._is_streaming and index >= self._next_index
         if is_streamed:
-            for missing in range(self._next_index, index):
-                self._window.request(missing)
+            for missing_index in range(self._next_index, index):
+                self._window.request(missing_index)
             if self._next_index:  # The time before the first value is not a pause of the stream.
                 self._pause_s = max(self._pause_s, now - self._last_at)
             self._next_index = index + 1
             self._last_at = now
-            timeout_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
+            timeout_s = max(self.round_trip.timeout_s(), TIMEOUT_PAUSES * self._pause_s, MIN_START_TIMEOUT_S)
             self._stream_deadline = now + min(timeout_s, MAX_STREAM_TIMEOUT_S)
             self._window.discard(index)  # Only values that were requested one by one measure the round trip.
         else:
@@ -200,7 +200,7 @@ class SettingWrite(Transfer[Setting]):
         super().__init__(target_system, target_component, **options)
         self._name = name
         self._value, self._type = value, type
-        self._before = before
+        self._old_value = before
         self._repeated_answers: RepeatedAnswers[Setting] = RepeatedAnswers(_is_same)
         self._stale_answers = StaleAnswerFilter(self.round_trip)
         self._is_writing = False
@@ -257,7 +257,7 @@ class SettingWrite(Transfer[Setting]):
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
         """Write or read again, or end the write after enough equal answers."""
         self._repeated_answers.add(reported)
-        is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
+        is_unchanged = self._old_value is not None and settings_equal(reported.value, self._old_value)
         if not self._repeated_answers.are_conclusive(is_unchanged=is_unchanged):
             if is_unchanged:
                 self._write(now)

@@ -65,7 +65,7 @@ class _SentRequest(NamedTuple):
     """One transmission of a request. Each has its own sequence number, so every answer measures the round trip."""
 
     offset: int
-    at: float
+    sent_at: float
 
 
 class _Burst:
@@ -153,9 +153,9 @@ class FtpDownload(FtpExchange[int]):
             self._receive_burst(reply, now)
         elif reply.request_opcode == MavFtpOpcode.READFILE:
             # A reply has the sequence number of its request plus 1.
-            sent = self._reads.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
-            if sent is not None:
-                self._receive_read(sent, reply, now)
+            request = self._reads.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
+            if request is not None:
+                self._receive_read(request, reply, now)
         if not self.done:
             self._proceed(now)
 
@@ -222,9 +222,9 @@ class FtpDownload(FtpExchange[int]):
         else:
             self._fail(self._refused(reply))
 
-    def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
-        offset = sent.offset
-        self._requests.on_answer(offset, now, sent_at=sent.at)
+    def _receive_read(self, request: _SentRequest, reply: FtpMessage, now: float) -> None:
+        offset = request.offset
+        self._requests.on_answer(offset, now, sent_at=request.sent_at)
         if reply.is_ack and reply.data and not self._is_past_size(offset):
             self._add(offset, reply.data, now)
         # EOF or an ACK without data marks the end of the file. Data beyond the known size is dropped: the file has
@@ -409,15 +409,16 @@ class FtpUpload(FtpExchange[None]):
         if reply.request_opcode != MavFtpOpcode.WRITEFILE:
             return
         # A reply has the sequence number of its request plus 1.
-        sent = self._sent_by_sequence.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
-        if sent is None or sent.offset not in self._unwritten:
+        request = self._sent_by_sequence.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
+        is_repeated = request is not None and request.offset not in self._unwritten
+        if request is None or is_repeated:
             return
         if not reply.is_ack:
             self._fail(self._refused(reply))
             return
-        offset = sent.offset
+        offset = request.offset
         del self._unwritten[offset]
-        self._requests.on_answer(offset, now, sent_at=sent.at)
+        self._requests.on_answer(offset, now, sent_at=request.sent_at)
         self._written_bytes += len(self._block(offset))
         self._report_progress(now, self._written_bytes, len(self._data))
         self._proceed(now)

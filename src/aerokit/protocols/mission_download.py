@@ -153,7 +153,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     def _on_item(self, item: MissionItemInt | MissionItem, now: float) -> None:
         if self._count is None or item.seq not in self._requested_at:
-            return
+            return  # The item is late or a copy.
         if self._request_counts[item.seq] == 1:  # For a repeated request, the round trip is unknown.
             self.round_trip.add_sample(now - self._requested_at[item.seq])
         del self._requested_at[item.seq]
@@ -168,9 +168,10 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # ERROR may answer a late copy of an item that an earlier upload has sent, so it counts only if the request
-            # is not answered in time. ArduPilot (window above 1) sends one for each copy, and has no transfer that it
-            # could drop (MissionItemProtocol.cpp, handle_mission_request_int): the request is only repeated.
+            # ERROR may answer a late copy of an item that an earlier upload has sent, so ERROR counts only if the
+            # request is not answered in time. ArduPilot (window above 1) sends an ERROR for each copy. The request is
+            # then only repeated, because ArduPilot has no transfer that it could have dropped
+            # (MissionItemProtocol.cpp, handle_mission_request_int).
             self._has_error = True
         elif result not in (
             MavMissionResult.ACCEPTED,
@@ -261,7 +262,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # ------------------------------------------------------------------------------------ end
 
     def _acknowledge_and_finish(self) -> None:
-        # If PX4 (window 1) misses the acknowledgement, it accepts no upload for 5 s. PX4 therefore gets two of them.
+        # PX4 (window 1) gets the acknowledgement twice, because after missing it, PX4 accepts no upload for 5 s.
         transmissions = 2 if self._window == 1 else 1
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions
         items = tuple(self._items[seq] for seq in self._indices)

@@ -160,7 +160,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             may_send_ahead = self._window > 1  # With a window of 1, items are only sent on request.
             self._repeat_unconfirmed(now, ahead=1 if may_send_ahead else 0)
         elif self._attempt % 2 == 0:
-            # If the confirmation was lost, the vehicle repeats it when it receives the last item again.
+            # The vehicle repeats a lost confirmation when it receives the last item again.
             self._send(self._end - 1, now)
         else:
             self._repeat_unconfirmed(now)
@@ -256,14 +256,14 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _is_answer_to_copy(self, result: int, now: float) -> bool:
         """Return True if ``result`` answers a second copy of MISSION_WRITE_PARTIAL_LIST. The upload then continues."""
-        # ArduPilot answers the second one by DENIED (MissionItemProtocol.cpp, handle_mission_write_partial_list). After
+        # ArduPilot answers the copy by DENIED (MissionItemProtocol.cpp, handle_mission_write_partial_list). After
         # TRANSFER_EXPIRY_S, DENIED may instead be about another station's transfer.
         is_recent = now - self._progress_at < TRANSFER_EXPIRY_S
         return result == MavMissionResult.DENIED and self.is_partial and self._vehicle_has_requested and is_recent
 
     def _on_error(self, now: float) -> None:
-        # ERROR need not mean that the upload has failed. PX4 also sends it when it is busy, when MISSION_COUNT arrives
-        # twice and, like ArduPilot, for an item after the end.
+        # ERROR need not mean that the upload has failed. PX4 also sends ERROR while it is busy, when MISSION_COUNT
+        # arrives twice and, like ArduPilot, for an item after the end.
         if not self._vehicle_has_requested:
             self._wait_while_busy(now)
         elif self._error_at is None:  # Repeat an item. The upload ends only with another ERROR.

@@ -271,11 +271,11 @@ class SetCurrentItem(Transfer[None]):
 
     def _has_passed(self, seq: int) -> bool:
         """Return True if the vehicle has reached our item and left it for ``seq``."""
-        before = self._reported
-        if before is None:
+        previous_seq = self._reported
+        if previous_seq is None:
             return False
-        has_moved_on = before <= self._seq < seq
-        has_jumped_back = self._seq < seq < before  # The vehicle went back, reached our item and left it.
+        has_moved_on = previous_seq <= self._seq < seq
+        has_jumped_back = self._seq < seq < previous_seq  # The vehicle went back, reached our item and left it.
         return has_moved_on or has_jumped_back
 
     def _send(self, now: float) -> None:

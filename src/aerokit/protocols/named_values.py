@@ -24,7 +24,7 @@ ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
 # The stream of a list has stopped if nothing arrives for this many times its longest pause so far.
-PAUSES = 4
+TIMEOUT_PAUSES = 4
 # A list gets at least this many seconds to start. An earlier second request would restart the list.
 MIN_START_TIMEOUT_S = 0.3
 # Maximum number of times that old values are requested again because the number of parameters has changed.

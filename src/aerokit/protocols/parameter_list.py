@@ -10,7 +10,7 @@ from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, parameter_of
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import MAX_PARAMETERS, same_value
-from aerokit.protocols.named_values import MIN_START_TIMEOUT_S, PAUSES, ValueList
+from aerokit.protocols.named_values import MIN_START_TIMEOUT_S, TIMEOUT_PAUSES, ValueList
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -119,7 +119,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._window.on_answer(index, now)
         # The answer to a request delays the stream, so it also restarts the stream's time-out. Near the end of the
         # list it does not, so that the last missing values are requested early.
-        if self._is_streaming and (is_streamed or (is_requested and not self._is_near_end)):
+        restarts_timeout = is_streamed or (is_requested and not self._is_near_end)
+        if self._is_streaming and restarts_timeout:
             self._stream_deadline = now + self._stream_timeout_s()
         parameter = parameter_of(message, self._bytewise)
         if parameter.name not in self._parameters and len(self._parameters) >= MAX_PARAMETERS:
@@ -140,7 +141,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
 
     def _on_refusal(self, message: ParamError) -> None:
         index = message.param_index  # PX4 does not fill in the name.
-        if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._received:
+        is_awaited = index in self._window and index not in self._received
+        if message.error != MavParamError.DOES_NOT_EXIST or not is_awaited:
             return
         self._refusals[index] = self._refusals.get(index, 0) + 1
         # A single error does not prove that the list has become shorter: PX4 also sends it if it has no room for the
@@ -165,8 +167,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._must_request_missing = True
 
     def _on_streamed_value(self, index: int, now: float) -> None:
-        for missing in range(self._next_index, min(index, self._count or 0)):
-            self._window.request(missing)
+        for missing_index in range(self._next_index, min(index, self._count or 0)):
+            self._window.request(missing_index)
         if self._streamed_count:
             self._pause_s = max(now - self._last_at, PAUSE_DECAY * self._pause_s)
         self._next_index = index + 1
@@ -202,7 +204,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
 
     def _stream_timeout_s(self) -> float:
         """Return after how many seconds without a value the stream counts as stopped."""
-        seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
+        seconds = max(self.round_trip.timeout_s(), TIMEOUT_PAUSES * self._pause_s)
         if self._streamed_count < MIN_STREAMED:  # A single value may be the answer to our request by index.
             return max(seconds, MIN_START_TIMEOUT_S)
         # Near the end, waiting for a further group of values would take longer than requesting the rest.

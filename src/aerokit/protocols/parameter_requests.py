@@ -125,7 +125,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         return ParamRequestRead(self.target_system, self.target_component, name, index)
 
     def _process_overdue(self, now: float) -> None:
-        if self._may_probe and (overdue := self._overdue(now)):
+        overdue = self._overdue(now) if self._may_probe else []
+        if overdue:
             self._reject_if_requested_often(overdue, now)
             self._is_probe_wanted = True
 
@@ -213,7 +214,7 @@ class ParameterWrites(ParameterRequests):
         super().__init__(
             target_system, target_component, self._requested, bytewise=bytewise, own_system=own_system, **options
         )
-        self._before = dict(before)
+        self._old_values = dict(before)
         self._recently_written = frozenset(recent)
         self._must_read_again = set(self._recently_written)
         self._must_write = set(self._requested)  # names whose next request is a PARAM_SET
@@ -268,8 +269,8 @@ class ParameterWrites(ParameterRequests):
         if self._is_too_early(name, now, may_measure=self._window.attempts(name) == 1):
             return
         answers.add(reported)
-        before = self._before.get(name)  # None if unknown
-        may_be_unchanged = before is None or same_value(reported.value, before)
+        old_value = self._old_values.get(name)  # None if unknown
+        may_be_unchanged = old_value is None or same_value(reported.value, old_value)
         if may_be_unchanged and not is_as_requested:
             self._must_write.add(name)  # The vehicle may still have the old value, so PARAM_SET is sent again.
         is_conclusive = answers.are_conclusive(is_unchanged=may_be_unchanged)

@@ -200,7 +200,8 @@ class RequestWindow(PendingRequests[KeyT]):
 
     def _timeout_s(self, attempts: int) -> float:
         round_trip = self._round_trip
-        # Each silence of the whole link lengthens the wait. The loss of single frames does not.
+        # Each silence of the whole link lengthens the wait. The loss of single frames does not: `RoundTrip` waits as
+        # long for attempt 2 as for attempt 1.
         seconds = round_trip.timeout_s(min(attempts, 2) + self._timeouts)
         if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:
             seconds = min(seconds, max(FEW_LEFT_TIMEOUT_S, 2 * round_trip.smoothed_s))

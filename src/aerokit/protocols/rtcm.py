@@ -41,7 +41,8 @@ def message_number(frame: bytes) -> int | None:
 
     The result is None for an empty message, which RTCM allows as a filler.
     """
-    return None if len(frame) < HEADER_SIZE + 2 + CRC_SIZE else frame[3] << 4 | frame[4] >> 4
+    body = frame[HEADER_SIZE:-CRC_SIZE]
+    return None if len(body) < 2 else body[0] << 4 | body[1] >> 4  # the first 12 bits of the body
 
 
 def _frame_size(data: bytes, begin: int) -> int | None:
@@ -136,7 +137,7 @@ def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     # A receiver considers a split message complete after four fragments, or after a fragment that is not full.
     if is_split and len(pieces) < MAX_FRAGMENTS and len(pieces[-1]) == FRAGMENT_SIZE:
         pieces.append(b"")
-    # Bit 0 is set if the message is split. Bits 1 and 2 are the number of the fragment.
+    # Bit 0 is set if the message is split. Bits 1 and 2 are the number of the fragment, bits 3 to 7 the sequence.
     flags = (sequence & 0x1F) << 3 | is_split
     return [
         GpsRtcmData(flags=flags | number << 1, len=len(piece), data=piece.ljust(FRAGMENT_SIZE, b"\0"))

@@ -68,7 +68,7 @@ class LoopThread:
             # ThreadFuture).
             if isinstance(error.__context__, KeyboardInterrupt):
                 raise error.__context__ from None
-            raise _not_started(error) from error
+            raise _start_error(error) from error
         except BaseException:
             self._abort()
             raise
@@ -420,7 +420,7 @@ def _run_loop(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -
         atexit.unregister(calls.finish)
 
 
-def _not_started(error: Exception) -> LinkOpenError:
+def _start_error(error: Exception) -> LinkOpenError:
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     link_error = LinkOpenError(f"the event loop's thread cannot start: {reason}")
     link_error.errno = error.errno if isinstance(error, OSError) else None

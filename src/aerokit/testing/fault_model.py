@@ -115,7 +115,7 @@ class FaultyPath:
         is_duplicated = chance() < model.duplication
         is_reordered = chance() < model.reordering
         is_corrupted = chance() < model.corruption
-        jitter = chance() * model.jitter_s
+        jitter_s = chance() * model.jitter_s
         self.frames += 1
         self.bytes += len(frame)
         sent_at = self._transmit(len(frame), now)
@@ -127,7 +127,7 @@ class FaultyPath:
             return []
         if is_corrupted:
             frame = self._corrupt(frame)
-        due = sent_at + model.delay_s + jitter
+        due = sent_at + model.delay_s + jitter_s
         if is_reordered:
             self.reordered += 1
             due += model.overtaken_s
@@ -154,8 +154,8 @@ class FaultyPath:
         return air.busy_until
 
     def _is_outage(self, time: float) -> bool:
-        elapsed = time - (self._started_at or 0.0)
-        return any(begin <= elapsed < end for begin, end in self.model.outages)
+        elapsed_s = time - (self._started_at or 0.0)
+        return any(begin_s <= elapsed_s < end_s for begin_s, end_s in self.model.outages)
 
     def _corrupt(self, frame: bytes) -> bytes:
         self.corrupted += 1

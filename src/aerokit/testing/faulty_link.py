@@ -286,7 +286,7 @@ class FaultyLink(Link):
     def _on_stalled(self, is_stalled: bool) -> None:
         stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
-        if self._incoming_path is None or is_stalled == was_stalled:
+        if self._incoming_path is None or is_stalled == was_stalled:  # The link is not open, or nothing has changed.
             return
         now = asyncio.get_running_loop().time()
         if stalled_at is None:  # The stall begins.
@@ -393,7 +393,7 @@ class _DeliveryQueue:
         due, _, _ = self._waiting[0]
         if self._timer is not None:
             if self._timer_at <= due:
-                return
+                return  # The timer is early enough.
             self._timer.cancel()
         self._timer = self.loop.call_at(due, self._run)
         self._timer_at = due

@@ -29,6 +29,8 @@ _MARGIN = 60
 _HEIGHT = _MAP_HEIGHT + _PROFILE_HEIGHT
 _FONT_SIZE = 12
 _MAX_NAMES = 8
+_NAME_WIDTH = 90
+_NAME_BASELINE = 18
 _FAILED = "#e00000"
 _LABEL_HEIGHT = 13
 _LABEL_GAP = 8  # Pixels between a point and its label.
@@ -322,7 +324,8 @@ def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
 def _legend(tracks: Sequence[Drawable]) -> list[_Shape]:
     named = list(zip(tracks, _colours(len(tracks)), strict=True))[:_MAX_NAMES]
     return [
-        _Text(_MARGIN + 90 * number, 18, track.name, "start", colour) for number, (track, colour) in enumerate(named)
+        _Text(_MARGIN + _NAME_WIDTH * number, _NAME_BASELINE, track.name, "start", colour)
+        for number, (track, colour) in enumerate(named)
     ]
 
 

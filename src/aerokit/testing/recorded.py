@@ -120,7 +120,7 @@ class RecordedMissions(MissionServer):
             return self._written[mission_type]
         items = None
         for plan in self._vehicle.recording.plans:  # The plans are in the order of their times.
-            is_first = items is None
+            is_first = items is None  # The first plan is served from the start, like the first value of a parameter.
             if plan.mission_type == mission_type and (is_first or plan.since <= self._vehicle.position_s):
                 items = plan.items
         return items
@@ -181,7 +181,9 @@ def _item_message(item: AnyItem, seq: int, client: ComponentIds, *, wants_float:
     """Convert a recorded item to MISSION_ITEM (``wants_float``) or MISSION_ITEM_INT."""
     # In MISSION_ITEM_INT, x and y are degrees times 1e7, in local frames metres times 1e4, and in MAV_FRAME_MISSION
     # numbers without a scale.
-    scale = 1.0 if item.frame == MavFrame.MISSION else 1e4 if item.frame in LOCAL_FRAMES else 1e7
+    scale = 1e4 if item.frame in LOCAL_FRAMES else 1e7
+    if item.frame == MavFrame.MISSION:
+        scale = 1.0
     was_float = isinstance(item, m.MissionItem)
     place = (item.x, item.y) if was_float else (item.x / scale, item.y / scale)
     converted = item_from(item)  # with x and y as recorded
@@ -345,11 +347,11 @@ class RecordedVehicle(SimulatedVehicle):
     def _latest_message(self, message_id: int) -> Message | None:
         """Return the latest played message with this id, or else the first recorded one, or None."""
         stream = self.recording.stream
-        own = (self.system_id, self.component_id)
+        own_ids = (self.system_id, self.component_id)
         played = stream[: self._next]
         not_yet_played = stream[self._next :]
         for _, frame in (*reversed(played), *not_yet_played):
-            if frame.message_id == message_id and (frame.system_id, frame.component_id) == own:
+            if frame.message_id == message_id and (frame.system_id, frame.component_id) == own_ids:
                 return STANDARD.decode(frame)
         return None
 

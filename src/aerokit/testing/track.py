@@ -113,7 +113,7 @@ class Track(Sequence[TrackPoint]):
     @property
     def armed_s(self) -> float:
         """Simulated seconds for which the vehicle was armed."""
-        return sum(after.time_s - before.time_s for before, after in pairwise(self) if before.armed)
+        return sum(following.time_s - point.time_s for point, following in pairwise(self) if point.armed)
 
     @property
     def max_speed_m_s(self) -> float:
@@ -351,8 +351,9 @@ def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
         if has_not_started or has_ended:
             continue
         first_place = (north, east, up + first_home_m)
-        after = second_path[min(index, len(second_path) - 1)]
-        second_place = _interpolated(second_path[index - 1], after, point.time_s)
+        earlier = second_path[index - 1]
+        later = second_path[min(index, len(second_path) - 1)]
+        second_place = _interpolated(earlier, later, point.time_s)
         closest = min(closest, (math.dist(first_place, second_place), point.time_s))
     return closest
 
@@ -361,9 +362,9 @@ def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
 _TimedPlace = tuple[float, tuple[float, float, float]]
 
 
-def _interpolated(before: _TimedPlace, after: _TimedPlace, time_s: float) -> tuple[float, float, float]:
-    start_s, start = before
-    end_s, end = after
+def _interpolated(earlier: _TimedPlace, later: _TimedPlace, time_s: float) -> tuple[float, float, float]:
+    start_s, start = earlier
+    end_s, end = later
     share = (time_s - start_s) / (end_s - start_s) if end_s > start_s else 0.0
     north, east, up = (from_ + share * (to - from_) for from_, to in zip(start, end, strict=True))
     return north, east, up

@@ -143,8 +143,8 @@ def wind(text: str) -> tuple[float, ...]:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    has_gusts = len(values) == 3
-    is_in_range = all(abs(value) <= _MAX_WIND_M_S for value in values) and not (has_gusts and values[-1] < 0)
+    gusts_m_s = values[2] if len(values) == 3 else 0.0
+    is_in_range = gusts_m_s >= 0 and all(abs(value) <= _MAX_WIND_M_S for value in values)
     if len(values) not in (2, 3) or not is_in_range:
         raise ArgumentTypeError(
             f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to {_MAX_WIND_M_S:g}"

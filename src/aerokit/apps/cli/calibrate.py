@@ -194,5 +194,5 @@ def lines_of(step: CalibrationStep) -> list[str]:
 
 
 def bar(progress: float) -> str:
-    done = round(progress * _BAR_WIDTH)
-    return f"  [{'#' * done}{'-' * (_BAR_WIDTH - done)}] {100 * progress:3.0f} %"
+    filled = round(progress * _BAR_WIDTH)
+    return f"  [{'#' * filled}{'-' * (_BAR_WIDTH - filled)}] {100 * progress:3.0f} %"

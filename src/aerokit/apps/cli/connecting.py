@@ -277,7 +277,8 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 
 def _simulator_hint(connection: Connection) -> str:
     link_address = connection.link.address.replace("0.0.0.0", "127.0.0.1")
-    if not link_address.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
+    has_received_bytes = any(peer.bytes for peer in connection.statistics())
+    if not link_address.startswith("udpin:127.0.0.1:") or has_received_bytes:
         return ""
     return f" (to simulate one, in another terminal: aerokit sim {link_address.replace('udpin', 'udpout')})"
 

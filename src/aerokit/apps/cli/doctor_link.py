@@ -142,8 +142,8 @@ class LinkExamination:
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
         frame = heartbeat.received_frame
         if frame is not None:
-            pairs = self._types_and_autopilots.setdefault((frame.system_id, frame.component_id), set())
-            pairs.add((heartbeat.type, heartbeat.autopilot))
+            senders = self._types_and_autopilots.setdefault((frame.system_id, frame.component_id), set())
+            senders.add((heartbeat.type, heartbeat.autopilot))
 
     def _on_duplicate_sender(self, event: DuplicateSender) -> None:
         self._duplicate_sources.add((event.system_id, event.component_id))
@@ -185,7 +185,7 @@ class LinkExamination:
         yield Finding("problem", "vehicle", text, advice)
 
     def _ambiguous_ids(self) -> Iterator[Finding]:
-        ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
+        ambiguous = {source for source, senders in self._types_and_autopilots.items() if len(senders) > 1}
         for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
             yield Finding(
                 "problem",

@@ -143,8 +143,9 @@ async def _get_logs(options: argparse.Namespace) -> int:
         for entry in _selected_logs(entries, options):
             target = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
             # The vehicle counts from 1 again after its logs were erased, so the file may be of another flight.
-            if target.exists() and (kept := keep_existing(target)) is not None:
-                print(f"aerokit: {target} existed and was kept as {kept}", file=sys.stderr)
+            kept_as = keep_existing(target) if target.exists() else None
+            if kept_as is not None:
+                print(f"aerokit: {target} existed and was kept as {kept_as}", file=sys.stderr)
             with progress_bar(target.name, unit="B") as on_progress:
                 await vehicle.logs.download(
                     entry, target, method=options.method, idle_timeout_s=options.patience, on_progress=on_progress

@@ -65,25 +65,25 @@ def _parse_filter(text: str) -> tuple[str, tuple[str, ...]]:
 
     Without ``@ENDPOINT``, which means all endpoints, the name is "".
     """
-    names, at, endpoint = text.partition("@")
+    names, separator, endpoint = text.partition("@")
     patterns = tuple(name.strip() for name in names.split(",") if name.strip())
     if not patterns:
         raise argparse.ArgumentTypeError(f"{text!r} has no message name; expected {_FILTER_EXAMPLE}")
-    if at and not endpoint:
+    if separator and not endpoint:
         raise argparse.ArgumentTypeError(f"{text!r} has no endpoint after the @; expected {_FILTER_EXAMPLE}")
     return endpoint, patterns
 
 
 def _parse_rates(text: str) -> tuple[str, dict[str, float]]:
     """Parse ``MESSAGE=HZ,…[@ENDPOINT]`` into the endpoint ("" for all) and the rate of each message."""
-    endpoint, parts = _parse_filter(text)
+    endpoint, rate_texts = _parse_filter(text)
     rates = {}
-    for part in parts:
-        name, _, hz = part.partition("=")
+    for rate_text in rate_texts:
+        name, _, hz = rate_text.partition("=")
         try:
             rates[name] = float(hz)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{part!r} is not a rate; expected ATTITUDE=5 (in Hz)") from None
+            raise argparse.ArgumentTypeError(f"{rate_text!r} is not a rate; expected ATTITUDE=5 (in Hz)") from None
     return endpoint, rates
 
 

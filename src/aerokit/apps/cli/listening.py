@@ -236,11 +236,11 @@ def _printing_kept_name(path: str | None) -> Iterator[None]:
         yield
         return
     # Textual hides the link's log message with the new name, so the name is found by the file's inode.
-    earlier = os.stat(path)
+    existing_file = os.stat(path)
     yield
-    for kept in Path(path).resolve().parent.iterdir():
-        if kept.name != Path(path).name and os.path.samestat(kept.lstat(), earlier):
-            print(f"{path} existed and was kept as {kept.name}", file=sys.stderr)
+    for file in Path(path).resolve().parent.iterdir():
+        if file.name != Path(path).name and os.path.samestat(file.lstat(), existing_file):
+            print(f"{path} existed and was kept as {file.name}", file=sys.stderr)
 
 
 def _detach_terminal() -> None:

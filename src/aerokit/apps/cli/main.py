@@ -179,7 +179,7 @@ class Parser(argparse.ArgumentParser):
         options = list(args[: args.index("--")] if "--" in args else args)
         names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
-            if name != "--connect" and not any(known.startswith(name) for known in self._option_string_actions):
+            if name != "--connect" and not any(option.startswith(name) for option in self._option_string_actions):
                 self._exit_unrecognized([name])
 
     def _exit_unrecognized(self, unknown: Sequence[str]) -> NoReturn:

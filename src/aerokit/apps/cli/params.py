@@ -175,7 +175,8 @@ async def _set(options: argparse.Namespace) -> int:
         }
     code = _emit_results(options, results.values(), known_names, metadata)
     has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
-    if has_changed and metadata is None and not (options.force or options.json):
+    is_unchecked = metadata is None and not options.force
+    if has_changed and is_unchecked and not options.json:
         print(ranges_unchecked_text(vehicle))
     return code
 
@@ -205,7 +206,8 @@ async def _load(options: argparse.Namespace) -> int:
     failed_count = sum(result.error is not None for result in changed)
     not_set = f", {failed_count} were not set" if failed_count else ""
     print(f"{len(results)} parameters in {options.file}, {len(changed) - failed_count} of them differed{not_set}")
-    if len(changed) > failed_count and metadata is None and not options.force:
+    is_unchecked = metadata is None and not options.force
+    if len(changed) > failed_count and is_unchecked:
         print(ranges_unchecked_text(vehicle))
     return code
 
@@ -220,12 +222,12 @@ def _check_file(file_values: ParameterFile, table: ParameterTable, vehicle: Vehi
     unknown = []
     for name, value in file_values.items():
         line = file_values.places[name]
-        known = resolve_known(name.upper() if names_are_upper_case else name, table)
-        if known is None:
+        target = resolve_known(name.upper() if names_are_upper_case else name, table)
+        if target is None:
             unknown.append(f"{line}: the vehicle has no parameter {name}{suggestion(name, table, count=3)}")
             continue
         try:
-            checked_value(name, known.to_vehicle(value), known.parameter.type)
+            checked_value(name, target.to_vehicle(value), target.parameter.type)
         except InvalidArgument as error:
             invalid.append(f"{line}: {error}")
     if invalid:
@@ -241,8 +243,8 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
     try:
         return await vehicle.parameters.read(name, idle_timeout_s=options.patience)
     except (ParameterRejected, ParameterTimeout) as error:
-        known = await _known_names(vehicle) if _is_unknown_name(error) else ()
-        error.args = (f"{_with_hint(name, error, known)}",)
+        known_names = await _known_names(vehicle) if _is_unknown_name(error) else ()
+        error.args = (f"{_with_hint(name, error, known_names)}",)
         raise
 
 
@@ -266,12 +268,13 @@ async def _known_names(vehicle: Vehicle) -> Collection[str]:
 def _with_hint(name: str, error: Exception, known_names: Collection[str]) -> str:
     """Return the text of an error. If the vehicle does not have the parameter, add similar ``known_names``."""
     text = str(error)
-    # A text with "replaced by" or "its name on" already contains the right name.
-    if not _is_unknown_name(error) or "replaced by" in text or "its name on" in text:
+    has_right_name = "replaced by" in text or "its name on" in text
+    if has_right_name or not _is_unknown_name(error):
         return text
     # The error's own suggestions are replaced, because they include only parameters that were already read.
     bare_text, _, _ = text.partition(" (did you mean")
-    beginnings = [known for known in known_names if len(known) >= _MIN_BEGINNING and name.upper().startswith(known)]
+    long_names = [known_name for known_name in known_names if len(known_name) >= _MIN_BEGINNING]
+    beginnings = [known_name for known_name in long_names if name.upper().startswith(known_name)]
     names = dict.fromkeys([*beginnings, *near_names(name, known_names, count=3)])
     hint = " or ".join(map(repr, list(names)[:3]))
     return f"{bare_text} (did you mean {hint}?)" if hint else f"{bare_text}; `aerokit params list` shows all names"

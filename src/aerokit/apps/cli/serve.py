@@ -107,7 +107,7 @@ def _token(path: str | None) -> str | None:
     if path is None:
         return None
     with open(path, encoding="utf-8-sig", errors="replace") as file:
-        return file.read(1000).strip()
+        return file.read(1000).strip()  # A token has at most 256 characters.
 
 
 def _is_loopback(host: str) -> bool:

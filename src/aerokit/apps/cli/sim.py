@@ -297,9 +297,9 @@ def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> Non
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
-    first = vehicles[0].system_id
-    last = vehicles[-1].system_id
-    return f"system {first}" if first == last else f"systems {first} to {last}"
+    first_id = vehicles[0].system_id
+    last_id = vehicles[-1].system_id
+    return f"system {first_id}" if first_id == last_id else f"systems {first_id} to {last_id}"
 
 
 def _client_address(address: str, argument: str) -> str:

@@ -155,14 +155,14 @@ def _gps_text(receiver: GpsReceiver) -> str:
 
 
 def _position_text(vehicle: Vehicle) -> str:
-    here = vehicle.position.latest
-    if here is None:
+    position = vehicle.position.latest
+    if position is None:
         return _UNKNOWN
     height = _UNKNOWN
-    if here.altitude_relative_m is not None:
-        height = f"{round(here.altitude_relative_m, 1) + 0.0:.1f} m"  # + 0.0 converts -0.0 to 0.0
-    old = f" ({vehicle.position.age:.0f} s ago)" if vehicle.position.age > SILENT_AFTER_S else ""
-    return f"{here.latitude_deg:.7f}, {here.longitude_deg:.7f}, height above home {height}{old}"
+    if position.altitude_relative_m is not None:
+        height = f"{round(position.altitude_relative_m, 1) + 0.0:.1f} m"  # + 0.0 converts -0.0 to 0.0
+    age_text = f" ({vehicle.position.age:.0f} s ago)" if vehicle.position.age > SILENT_AFTER_S else ""
+    return f"{position.latitude_deg:.7f}, {position.longitude_deg:.7f}, height above home {height}{age_text}"
 
 
 def _battery_text(battery: Battery) -> str:

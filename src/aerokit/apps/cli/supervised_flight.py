@@ -281,8 +281,9 @@ class FlightReport:
         """True if status lines are printed when there is no other output. Set it to False during questions."""
 
     def print_line(self, text: str) -> None:
-        here = self._vehicle.position
-        position = None if max(self._vehicle.heartbeat_age, here.age) > SILENT_AFTER_S else here.latest
+        cell = self._vehicle.position
+        is_recent = max(self._vehicle.heartbeat_age, cell.age) <= SILENT_AFTER_S
+        position = cell.latest if is_recent else None
         altitude = None if position is None else position.altitude_relative_m
         height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"  # + 0.0 converts -0.0 to 0.0
         self._last_line_at = self._vehicle.connection.now()
@@ -425,11 +426,11 @@ class FlightReport:
     def _status_text(self) -> str:
         vehicle = self._vehicle
         if vehicle.heartbeat_age > SILENT_AFTER_S:
-            here = vehicle.position.latest
-            height = None if here is None else here.altitude_relative_m
-            last = "" if height is None else f" at {height:.1f} m"
+            position = vehicle.position.latest
+            height = None if position is None else position.altitude_relative_m
+            height_text = "" if height is None else f" at {height:.1f} m"
             seconds = self.speedup * vehicle.heartbeat_age
-            return f"silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}"
+            return f"silent for {seconds:.0f} s; last received: {vehicle.mode_name}{height_text}"
         if not vehicle.is_armed:
             checks = readiness(vehicle, changes_mode=True)
             if checks.against_arming:  # "cannot arm yet: …" or "not known whether it arms: …"

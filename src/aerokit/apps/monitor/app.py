@@ -285,8 +285,8 @@ class Monitor(App[None]):
             add_line(f"{command} failed: {error}", "bold red")
         else:
             # `hold` returns when the vehicle reports the mode. A PX4 vehicle may still be moving then.
-            done = f"in {vehicle.mode_name}, may still be stopping" if method == "hold" else "done"
-            add_line(f"{command}: {done}", "bold green")
+            outcome = f"in {vehicle.mode_name}, may still be stopping" if method == "hold" else "done"
+            add_line(f"{command}: {outcome}", "bold green")
 
     def _update_list(self, options: OptionList) -> None:
         vehicles = self._model.vehicles

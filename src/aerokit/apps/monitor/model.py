@@ -85,18 +85,18 @@ class MonitorModel:
 
     def rates(self, system_id: int) -> list[tuple[str, float]]:
         """Return the names of a system's messages, and their rates in Hz in the last five seconds."""
-        first = self._count_samples[0]
-        last = self._count_samples[-1]
-        duration_s = last.at - first.at
+        oldest = self._count_samples[0]
+        newest = self._count_samples[-1]
+        duration_s = newest.at - oldest.at
         if duration_s <= 0.0:
             return []
         dialect = self.connection.bus.dialect
         rates = []
-        for (sender_id, message_id), count in last.counts.items():
+        for (sender_id, message_id), count in newest.counts.items():
             if sender_id == system_id:
                 message = dialect.get(message_id)
                 name = f"message {message_id}" if message is None else message.NAME
-                received = count - first.counts[sender_id, message_id]
+                received = count - oldest.counts[sender_id, message_id]
                 rates.append((name, received / duration_s))
         return rates
 

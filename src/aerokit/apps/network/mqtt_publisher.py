@@ -123,10 +123,12 @@ class MqttLink(BaseLink):
         A value is dropped if the link is closed or the buffer is full.
         """
         name = str(peer)
-        if self._receiver is None or (name not in self._unsent and len(self._unsent) >= MAX_WAITING):
+        replaces_unsent = name in self._unsent
+        has_room = replaces_unsent or len(self._unsent) < MAX_WAITING
+        if self._receiver is None or not has_room:
             self._count_dropped(1)
             return
-        if name in self._unsent:  # the new value replaces the unsent one
+        if replaces_unsent:
             self._count_dropped(1)
         self._unsent[name] = data
         self._send_unsent()
@@ -183,8 +185,10 @@ class MqttLink(BaseLink):
         while self._client is not None and self._unsent and not client.want_write():
             name = next(iter(self._unsent))
             client.publish(self._broker.key_space.state(name), self._unsent.pop(name))
-        if self._client is not None and client.want_write() and (sock := client.socket()):
-            asyncio.get_running_loop().add_writer(sock, self._continue_writing, client, sock)
+        if self._client is not None and client.want_write():
+            sock = client.socket()
+            if sock:
+                asyncio.get_running_loop().add_writer(sock, self._continue_writing, client, sock)
 
     def _continue_writing(self, client: Any, sock: Any) -> None:
         client.loop_write()

@@ -51,7 +51,7 @@ _IN_AIR = (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING
 
 
 class _Disarming(NamedTuple):
-    at: float
+    disarmed_at: float
     armed_for_s: float
 
 
@@ -118,11 +118,11 @@ class FlightWatch:
         """
         if self._disarming is None:
             return None
-        at, armed_for_s = self._disarming
+        disarmed_at, armed_for_s = self._disarming
         delay_s = self.disarm_delay_s
         is_automatic = delay_s is not None and delay_s > 0.0 and abs(armed_for_s - delay_s) <= DISARM_DELAY_TOLERANCE_S
         return {
-            "age_s": round(self._now() - at, 1),
+            "age_s": round(self._now() - disarmed_at, 1),
             "armed_for_s": round(armed_for_s, 1),
             "parameter": self.disarm_parameter,
             "delay_s": delay_s,
@@ -144,23 +144,24 @@ class FlightWatch:
         if order == "disarm":
             self._disarm_ordered_at = self._now()
 
-    def _on_armed(self, before: bool | None, is_armed: bool) -> None:
+    def _on_armed(self, was_armed: bool | None, is_armed: bool) -> None:
         now = self._now()
         if is_armed:
-            # If `before` is None, this is the first report, and the vehicle may have been armed long ago.
-            self._armed_at = now if before is False else None
+            # If `was_armed` is None, this is the first report, and the vehicle may have been armed long ago.
+            self._armed_at = now if was_armed is False else None
             self._was_in_air = self._vehicle.landed_state.latest in _IN_AIR
             self._disarming = None
             self._restart_detection()
-        elif before:
+        elif was_armed:
             self._disarmed_at = now
             was_ordered = now - self._disarm_ordered_at <= DISARM_ORDER_MAX_AGE_S
-            if self._armed_at is not None and not self._was_in_air and not was_ordered and self._crash is None:
-                self._disarming = _Disarming(at=now, armed_for_s=now - self._armed_at)
+            is_expected = self._was_in_air or was_ordered or self._crash is not None
+            if self._armed_at is not None and not is_expected:
+                self._disarming = _Disarming(disarmed_at=now, armed_for_s=now - self._armed_at)
 
-    def _on_landed(self, before: int | None, landed: int) -> None:
+    def _on_landed(self, previous_state: int | None, landed: int) -> None:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
-        has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
+        has_taken_off = previous_state == MavLandedState.ON_GROUND and landed in _IN_AIR
         if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
             # A crashed vehicle with running motors may report a take-off although it lies still. The report is believed
             # when the vehicle has climbed from its present altitude, or at once if this altitude is unknown.
@@ -168,26 +169,26 @@ class FlightWatch:
             if self._take_off_altitude_m is None:
                 self._dismiss_impact()
 
-    def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
+    def _on_velocity(self, _: Velocity | None, velocity: Velocity) -> None:
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
-        at = self._vehicle.velocity.updated_at
-        self._update_impact(at, velocity.down_m_s)
+        reported_at = self._vehicle.velocity.updated_at
+        self._update_impact(reported_at, velocity.down_m_s)
         if self._impact_at is None or self._is_impact_dismissed:
             return
         ground_speed_m_s, vertical_speed_m_s = velocity.ground_speed_m_s, abs(velocity.down_m_s)
         is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
         if self._crash is None:
-            self._check_crashed(at, self._impact_at, is_still=is_still)
+            self._check_crashed(reported_at, self._impact_at, is_still=is_still)
         else:
             is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
-            self._check_flies_again(at, is_still=is_still, is_fast=is_fast)
+            self._check_flies_again(reported_at, is_still=is_still, is_fast=is_fast)
 
-    def _update_impact(self, at: float, down_m_s: float) -> None:
+    def _update_impact(self, reported_at: float, down_m_s: float) -> None:
         """Start an impact when a fast descent ends suddenly. Forget it if the vehicle did not hit the ground."""
         self._detector.update()
         if down_m_s >= IMPACT_M_S:
-            self._last_sink_at = at
+            self._last_sink_at = reported_at
             self._last_sink_m_s = down_m_s
             return
         has_hit_ground = bool(self._detector.describe())
@@ -196,39 +197,39 @@ class FlightWatch:
         if not has_hit_ground:
             self._forget_impact()
         elif is_new_impact and self._crash is None:  # after a crash, no further impact is detected
-            self._start_impact(at, down_m_s)
+            self._start_impact(reported_at, down_m_s)
 
-    def _start_impact(self, at: float, down_m_s: float) -> None:
+    def _start_impact(self, reported_at: float, down_m_s: float) -> None:
         self._forget_impact()
-        self._impact_at = at
+        self._impact_at = reported_at
         self._impact_altitude_m = altitude_amsl(self._vehicle.telemetry)
-        self._was_sudden_stop = self._last_sink_m_s - down_m_s >= CRASH_STOP_M_S2 * (at - self._last_sink_at)
+        self._was_sudden_stop = self._last_sink_m_s - down_m_s >= CRASH_STOP_M_S2 * (reported_at - self._last_sink_at)
         armed = self._vehicle.armed.latest
-        self._is_impact_dismissed = not armed and at - self._disarmed_at > CRASH_ARMED_WITHIN_S
+        self._is_impact_dismissed = not armed and reported_at - self._disarmed_at > CRASH_ARMED_WITHIN_S
 
-    def _check_flies_again(self, at: float, *, is_still: bool, is_fast: bool) -> None:
+    def _check_flies_again(self, reported_at: float, *, is_still: bool, is_fast: bool) -> None:
         """Forget the crash if the armed vehicle moves or has climbed."""
-        self._moving_since = math.inf if is_still else min(self._moving_since, at)
+        self._moving_since = math.inf if is_still else min(self._moving_since, reported_at)
         # A slow vehicle counts as flying only after it has moved for CRASH_STILL_S. It had to lie still for the same
         # time before it counted as crashed.
-        is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
+        is_moving = is_fast or reported_at - self._moving_since >= CRASH_STILL_S
         if self._vehicle.armed.latest and (is_moving or self._has_climbed):
             self._dismiss_impact()
 
-    def _check_crashed(self, at: float, impact_at: float, *, is_still: bool) -> None:
+    def _check_crashed(self, reported_at: float, impact_at: float, *, is_still: bool) -> None:
         """Record a crash if there is evidence. Dismiss the impact if the evidence is missing for too long."""
         if is_still and self._is_at_impact_height():
-            self._still_since = min(self._still_since, at)
+            self._still_since = min(self._still_since, reported_at)
             self._still_samples += 1
-        elif at - impact_at <= CRASH_STILL_WITHIN_S:  # the vehicle may still come to rest
+        elif reported_at - impact_at <= CRASH_STILL_WITHIN_S:  # the vehicle may still come to rest
             self._still_since = math.inf
             self._still_samples = 0
         else:
             self._dismiss_impact()
             return
-        if at - impact_at > CRASH_EVIDENCE_WITHIN_S:
+        if reported_at - impact_at > CRASH_EVIDENCE_WITHIN_S:
             self._dismiss_impact()
-        elif self._has_crashed(at):
+        elif self._has_crashed(reported_at):
             ago_s = self._now() - impact_at
             self._crash = {
                 "text": self._detector.describe(),
@@ -242,8 +243,8 @@ class FlightWatch:
             return False
         return altitude_m - self._take_off_altitude_m >= CLIMBED_M
 
-    def _has_crashed(self, at: float) -> bool:
-        if at - self._still_since < CRASH_STILL_S or self._still_samples < CRASH_STILL_SAMPLES:
+    def _has_crashed(self, reported_at: float) -> bool:
+        if reported_at - self._still_since < CRASH_STILL_S or self._still_samples < CRASH_STILL_SAMPLES:
             return False
         is_on_ground = is_reported_on_ground(self._vehicle, max_age_s=CRASH_LANDED_MAX_AGE_S)
         if self._vehicle.armed.latest is False or is_on_ground:

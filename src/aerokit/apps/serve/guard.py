@@ -144,7 +144,7 @@ class SecurityMiddleware:
         except HttpProblem as problem:
             if scope["type"] == "websocket":
                 await receive()  # websocket.connect, which ASGI requires to be received before an answer
-                await send({"type": "websocket.close", "code": 1008})
+                await send({"type": "websocket.close", "code": 1008})  # "policy violation"
             else:
                 await problem_response(problem)(scope, receive, send_with_headers)
             return

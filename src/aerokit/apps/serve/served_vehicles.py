@@ -162,7 +162,8 @@ class ServedVehicles:
         return self._watches[vehicle]
 
     def _on_message(self, message: Mapping[str, Any]) -> None:
-        if message["type"] == "order" and (vehicle := self._vehicles.get(message["system_id"])) is not None:
+        vehicle = self._vehicles.get(message["system_id"]) if message["type"] == "order" else None
+        if vehicle is not None:
             self._flight_watch(vehicle).on_order(message["order"])
 
     async def _follow_connection(self, connection: Connection) -> None:

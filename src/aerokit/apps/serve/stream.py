@@ -29,6 +29,8 @@ MAX_ANONYMOUS_SOCKETS = 16
 """Maximum number of WebSockets without the token, if reading without a token is allowed."""
 MAX_QUEUED_MESSAGES = 256
 """Maximum number of queued messages for each client. If a queue is full, its oldest message is dropped and counted."""
+MAX_HELLO_ORDERS = 50
+"""Maximum number of earlier orders that a new client gets."""
 SEND_TIMEOUT_S = 10.0
 DEFAULT_RATE_HZ = 5.0
 MAX_RATE_HZ = 20.0
@@ -152,7 +154,7 @@ class StateStream:
             "type": "hello",
             "read_only": self._access.read_only,
             "events": list(self._served.events),
-            "orders": [record.to_dict() for record in self._orders.all()][-50:],
+            "orders": [record.to_dict() for record in self._orders.all()][-MAX_HELLO_ORDERS:],
         }
 
 
@@ -171,4 +173,4 @@ async def _deny(socket: WebSocket, problem: HttpProblem) -> None:
     if "websocket.http.response" in socket.scope.get("extensions", {}):
         await socket.send_denial_response(problem_response(problem))
     else:
-        await socket.close(1008)
+        await socket.close(1008)  # "policy violation"

@@ -83,7 +83,7 @@ class McapWriter:
             fix = topics.location_fix(unix_s, system_id, position, heading, velocity)
             self._put_foxglove(unix_s, system_id, "location", fix, topics.LOCATION_FIX)
             self._map_positions[system_id] = self._map_frame.east_north_up_m(position)
-        map_position = self._map_positions[system_id]
+        map_position = self._map_positions[system_id]  # stored with the vehicle's first position
         transform = topics.frame_transform(unix_s, system_id, map_position, attitude)
         self._put_foxglove(unix_s, system_id, "transform", transform, topics.FRAME_TRANSFORM)
         pose = topics.pose_in_frame(unix_s, map_position, attitude)

@@ -249,9 +249,9 @@ def _iso_second(unix_s: float) -> str:
     return datetime.fromtimestamp(unix_s, timezone.utc).isoformat()[:19]
 
 
-def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
-    """Return a function that converts records of the same type as ``record`` to table rows."""
-    if record.message is None:
+def _row_maker(columns: Sequence[TableColumn], first_record: LogRecord) -> _MakeRow:
+    """Return a function that converts records of the same type as ``first_record`` to table rows."""
+    if first_record.message is None:
         names = [column.field for column in columns]
         return lambda record: [
             record.system_id,

@@ -202,7 +202,7 @@ def location_fix(
         "longitude": position.longitude_deg,
         "altitude": position.altitude_amsl_m or 0.0,
         "position_covariance": [0.0] * 9,
-        "position_covariance_type": 0,
+        "position_covariance_type": 0,  # unknown
     }
     if heading_deg is not None:
         fix["heading"] = math.radians(heading_deg)

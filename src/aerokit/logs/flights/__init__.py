@@ -65,10 +65,12 @@ def check_log_name(path: Path) -> None:
 
 def progress_callback(total: int, on_progress: OnProgress | None) -> Callable[[int], object]:
     """Return a function that reports how many of ``total`` bytes were read so far to ``on_progress``."""
-    started = time.monotonic()
+    started_at = time.monotonic()
     if on_progress is None:
-        return lambda done: None
-    return lambda done: on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
+        return lambda bytes_read: None
+    return lambda bytes_read: on_progress(
+        TransferProgress(min(bytes_read, total), total, time.monotonic() - started_at)
+    )
 
 
 def read_flight(

@@ -32,6 +32,8 @@ _EARLY_MODE_CHANGE_S, _EARLY_DISARMING_S = 2.5, 0.5
 _BEFORE_ARMING_S, _AFTER_DISARMING_S = 1.0, 2.0
 # A failsafe is shown with values that were measured in this time before it.
 _BEFORE_S = 10.0
+# Of the status texts before a failsafe, the last few are shown. Texts less than _TEXT_GAP_S before it are left out.
+_TEXTS_BEFORE_S, _TEXT_GAP_S, _MAX_TEXTS = 15.0, 0.05, 4
 # A mode change within this time after a failsafe is attributed to the autopilot, even if the log has no cause.
 _AUTOPILOT_REACTION_S = 3.0
 # The kinds of failsafes (crashes and failures) at which autopilots disarm.
@@ -219,7 +221,7 @@ def _mode_change_after(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> 
         # Some autopilots always change the mode after disarming. Such a change is no reaction to a failsafe.
         was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
         was_commanded = change.by_autopilot is False  # `by_autopilot` is None if the log does not contain the cause
-        previous_mode = flight.mode_at(change.time_s - 1e-6)
+        previous_mode = flight.mode_at(change.time_s - 1e-6)  # just before the change
         if is_near and was_armed and not was_commanded and previous_mode:
             # If the log lacks the cause, an early change counts as the autopilot's. A later one may be the pilot's.
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
@@ -321,8 +323,8 @@ def _gps_context(flight: FlightLog, time_s: float) -> list[str]:
             (fix_type, "fix type {:.0f}"),
             (gps.at("hdop", time_s), "HDOP {:.1f}"),
         )
-        known = [template.format(value) for value, template in values if not math.isnan(value)]
-        text = f"receiver {number + 1}: {', '.join(known)}"
+        known_texts = [template.format(value) for value, template in values if not math.isnan(value)]
+        text = f"receiver {number + 1}: {', '.join(known_texts)}"
         earlier_satellites = gps.at("satellites", time_s - _BEFORE_S)
         if not math.isnan(earlier_satellites):
             text += f"; {earlier_satellites:.0f} satellites {_BEFORE_S:.0f} s before"
@@ -407,8 +409,8 @@ def _max_before(series: TimeSeries, name: str, time_s: float) -> float | None:
 
 def _limit_parameters(flight: FlightLog, kind: str, time_s: float) -> list[str]:
     values = ((name, flight.parameter_at(name, time_s)) for name in failsafe_parameters(flight, kind))
-    known = [_parameter_text(flight, name, value) for name, value in values if not math.isnan(value)]
-    return [f"parameters: {', '.join(known)}"] if known else []
+    known_texts = [_parameter_text(flight, name, value) for name, value in values if not math.isnan(value)]
+    return [f"parameters: {', '.join(known_texts)}"] if known_texts else []
 
 
 def _parameter_text(flight: FlightLog, name: str, value: float) -> str:
@@ -432,5 +434,5 @@ def failsafe_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:
-    texts = [text for text in flight.texts if time_s - 15 <= text.time_s < time_s - 0.05]
-    return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-4:]]
+    texts = [text for text in flight.texts if time_s - _TEXTS_BEFORE_S <= text.time_s < time_s - _TEXT_GAP_S]
+    return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-_MAX_TEXTS:]]

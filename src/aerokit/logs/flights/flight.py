@@ -58,9 +58,9 @@ class TimeSeries:
     def extend(self, times: Sequence[float], **columns: Sequence[float]) -> None:
         """Add many rows. Columns without values become NaN."""
         self.times.extend(times)
-        missing = array("d", [_NAN]) * len(times)
+        unknown_values = array("d", [_NAN]) * len(times)
         for name, column in self._values.items():
-            column.extend(columns.get(name, missing))
+            column.extend(columns.get(name, unknown_values))
 
     def has_values(self, *names: str) -> bool:
         """Return True if one of these columns has a known value. Without names, all columns are searched."""
@@ -86,8 +86,8 @@ class TimeSeries:
 
     def between(self, name: str, start_s: float, end_s: float) -> array[float]:
         """Return the values of a column in a time span, both ends included, without NaN."""
-        part = self._values[name][bisect_left(self.times, start_s) : self.index_at(end_s) + 1]
-        return array("d", (value for value in part if value == value))  # False for NaN
+        values = self._values[name][bisect_left(self.times, start_s) : self.index_at(end_s) + 1]
+        return array("d", (value for value in values if value == value))  # False for NaN
 
 
 class TangentPlane:
@@ -324,7 +324,7 @@ class FlightLog:
         known home is kept.
         """
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
-        if not is_valid:  # NaN is not valid, because it fails the comparisons
+        if not is_valid:  # NaN fails the comparisons; 0, 0 means that home is not set
             return
         home = Position(latitude_deg, longitude_deg, amsl_m if math.isfinite(amsl_m) else None)
         first_armed_s, _ = self.armed[0] if self.armed else (math.inf, math.inf)
@@ -333,8 +333,9 @@ class FlightLog:
 
     def set_parameter(self, time_s: float, name: str, value: float) -> None:
         """Record a parameter's value: its first value, or a change."""
-        first = self.parameters.setdefault(name, value)
-        before = self._latest_parameters.get(name, first)
+        first_value = self.parameters.setdefault(name, value)
+        old_value = self._latest_parameters.get(name, first_value)
         self._latest_parameters[name] = value
-        if value != before and not (math.isnan(value) and math.isnan(before)):
-            self.parameter_changes.append(ParameterChange(time_s, name, before, value))
+        is_unchanged = value == old_value or (math.isnan(value) and math.isnan(old_value))
+        if not is_unchanged:
+            self.parameter_changes.append(ParameterChange(time_s, name, old_value, value))

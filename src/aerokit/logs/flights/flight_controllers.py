@@ -91,8 +91,8 @@ class _RowReader(LogReader):
     def _unit(self, table: str, field: str) -> str:
         return ""
 
-    def _is_plausible_time(self, unix_s: float) -> bool:
-        """Return True if a row's time is possible. If it is not, count the row as damaged."""
+    def _accept_time(self, unix_s: float) -> bool:
+        """Return True if a row's time is possible. Otherwise, count the row as damaged."""
         is_plausible = 0 <= unix_s < _MAX_UNIX_S
         if not is_plausible:
             self._skipped += 1
@@ -148,7 +148,9 @@ class BinReader(_RowReader):
                 on_bytes(reader.offset)
             table, fields = message.get_type(), message.to_dict()
             fields.pop("mavpackettype", None)
-            if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
+            if table in ("FMT", "FMTU"):  # descriptions of the other tables
+                continue
+            if self._accept_time(message._timestamp):
                 self._note_missing_utc(message._timestamp)
                 states = _ardupilot_states(table, fields, reader)
                 yield LogRecord(
@@ -273,7 +275,7 @@ class UlogReader(_RowReader):
             if count % 1024 == 0:
                 on_bytes(size * count // max(total, 1))
             unix_s = begins_s + time_us / 1e6
-            if self._is_plausible_time(unix_s):
+            if self._accept_time(unix_s):
                 states = decoder.states(table, fields)
                 yield LogRecord(unix_s, system_id, component_id=1, table=table, fields=fields, states=states)
         self._note_skipped()
@@ -319,12 +321,13 @@ class _Px4States:
             return ()
 
     def _states(self, table: str, row: Mapping[str, Any]) -> StateValues:
+        # Old versions of PX4 do not have all flags. Without its flag, a value counts as valid.
         if table == "home_position" and row.get("valid_alt", 1):
             self._home_amsl_m = row["alt"]
         elif table == "vehicle_global_position" and row.get("lat_lon_valid", 1):
-            home = self._home_amsl_m
+            home_amsl_m = self._home_amsl_m
             amsl_m = row["alt"] if row.get("alt_valid", 1) else None
-            relative_m = None if home is None or amsl_m is None else amsl_m - home
+            relative_m = None if home_amsl_m is None or amsl_m is None else amsl_m - home_amsl_m
             return _optional_state("position", _position(row["lat"], row["lon"], amsl_m, relative_m))
         elif table == "vehicle_attitude":
             quaternion = (row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"])

@@ -152,12 +152,12 @@ class _Tables:
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
         # Rows have no checksum, so a time may be damaged. After a damaged late time, `TimeSeries.add` would give this
         # time to later rows, too.
-        time = times[row]
-        before = times[row - 1] if row else time
-        after = times[row + 1] if row + 1 < len(times) else time
-        is_outlier = time > after + _MAX_DISORDER_S or time < before - _MAX_DISORDER_S
-        neighbours_agree = 0.0 <= before <= after + _MAX_DISORDER_S  # otherwise one of them may be the outlier
-        return time <= self._max_s and not (is_outlier and neighbours_agree)
+        time_s = times[row]
+        previous_s = times[row - 1] if row else time_s
+        next_s = times[row + 1] if row + 1 < len(times) else time_s
+        is_outlier = time_s > next_s + _MAX_DISORDER_S or time_s < previous_s - _MAX_DISORDER_S
+        neighbours_agree = 0.0 <= previous_s <= next_s + _MAX_DISORDER_S  # otherwise one of them may be the outlier
+        return time_s <= self._max_s and not (is_outlier and neighbours_agree)
 
     def _first_time(self) -> int:
         # Use the row that is first in the file. The row with the lowest time could be a damaged one.
@@ -224,9 +224,9 @@ class _Reader:
             self._read_air, self._read_batteries, self._read_gps, self._read_vibration, self._read_estimator,
             self._read_radio, self._read_errors,
         )  # fmt: skip
-        for done, step in enumerate(steps, 1):
+        for steps_done, step in enumerate(steps, 1):
             step()
-            on_share(done / len(steps))
+            on_share(steps_done / len(steps))
         all_series = (flight.track, flight.attitude, flight.vibration, *flight.batteries.values())
         ends = [series.times[-1] for series in all_series if len(series)]
         if flight.texts:
@@ -250,8 +250,8 @@ class _Reader:
         modes = ardupilot_for(vehicle_type).modes
         has_reason = self._tables.has("MODE", "ModeNum", "Rsn")
         columns = ("ModeNum", "Rsn") if has_reason else ("ModeNum",)
-        for time_s, mode_number, *rest in self._tables.rows("MODE", *columns):
-            reason_number = rest[0] if has_reason else None
+        for time_s, mode_number, *optional_reason in self._tables.rows("MODE", *columns):
+            reason_number = optional_reason[0] if has_reason else None
             reason, failsafe, by_autopilot = MODE_REASONS.get(reason_number, ("", None, None))
             name = modes.name_of(mode_number)
             if self._flight.add_mode(time_s, name, reason, by_autopilot) and failsafe:
@@ -300,10 +300,10 @@ class _Reader:
         # If the estimator has no positions, use those of the first GPS receiver that has a 3D fix.
         number_column = ("I",) if self._tables.has("GPS", "I") else ()
         used_receiver: int | None = None
-        for time, status, latitude, longitude, amsl, *number in self._tables.rows(
+        for time, status, latitude, longitude, amsl, *optional_number in self._tables.rows(
             "GPS", "Status", "Lat", "Lng", "Alt", *number_column
         ):
-            receiver = number[0] if number_column else 0
+            receiver = optional_number[0] if number_column else 0
             if status >= GpsFixType.TYPE_3D_FIX and used_receiver in (None, receiver):
                 used_receiver = receiver
                 track.add(time, latitude, longitude, amsl, NAN)
@@ -365,9 +365,9 @@ class _Reader:
         columns = [instance, "Volt", "Curr", "CurrTot"]
         if has_percent:
             columns.append("RemPct")
-        for time_s, number, voltage, current, used, *rest in self._tables.rows("BAT", *columns):
-            is_known = has_percent and rest[0] != _NO_PERCENT
-            self._flight.battery(number).add(time_s, voltage, current, used, rest[0] if is_known else NAN)
+        for time_s, number, voltage, current, used, *optional_percent in self._tables.rows("BAT", *columns):
+            percent = optional_percent[0] if has_percent else _NO_PERCENT
+            self._flight.battery(number).add(time_s, voltage, current, used, NAN if percent == _NO_PERCENT else percent)
 
     def _read_gps(self) -> None:
         # GPA has the accuracy for each row of GPS. Rows belong together if time and receiver are the same.

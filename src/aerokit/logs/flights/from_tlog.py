@@ -66,6 +66,7 @@ def _first_autopilot(flight: FlightLog, system_id: int | None) -> tuple[m.Heartb
     records = 0
     for _, raw in read_tlog(flight.path):
         records += 1
+        # The header of MAVLink 2 ends with three bytes for the message id, the one of MAVLink 1 with a single byte.
         message_id = raw[7:10] if raw[0] == MAGIC_V2 else raw[5:6] + b"\0\0"
         if message_id == _HEARTBEAT_ID and _is_valid(raw):
             frame = Frame.parse(raw)
@@ -152,7 +153,7 @@ class _Reader:
                     begins_at = previous_unix_s = unix_s
                 elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
                     step_s = unix_s - previous_unix_s
-                    if abs(step_s) > _DOUBTFUL_JUMP_S and self._is_time_damaged(unix_s):
+                    if abs(step_s) > _DOUBTFUL_JUMP_S and not self._accept_jump(unix_s):
                         continue
                     if step_s > 0:
                         paused_s += step_s
@@ -166,6 +167,7 @@ class _Reader:
                     on_bytes(file.tell())
                 if unix_s > ends_at:
                     ends_at = unix_s
+                # Offsets: https://mavlink.io/en/guide/serialization.html. The sender is its system and component id.
                 if raw[0] == MAGIC_V2:
                     message_id, sender, sequence = raw[7:10], raw[5:7], raw[4]
                 else:
@@ -199,14 +201,17 @@ class _Reader:
         link.end(new_frames, last_frame_at - begins_at, flight.duration_s, paused_s)
         self._finish()
 
-    def _is_time_damaged(self, unix_s: float) -> bool:
-        """Return True if a time after a jump is damaged. It is not if the last skipped record has about that time."""
+    def _accept_jump(self, unix_s: float) -> bool:
+        """Return True if the clock has jumped to this time: the last skipped record has about the same time.
+
+        Otherwise, count the record with this time as damaged.
+        """
         if abs(unix_s - self._doubtful_unix_s) <= _DOUBTFUL_JUMP_S:
-            self._damaged -= 1  # the clock has jumped, so the skipped record was not damaged
-            return False
+            self._damaged -= 1  # The skipped record was not damaged.
+            return True
         self._doubtful_unix_s = unix_s
         self._damaged += 1
-        return True
+        return False
 
     def _note_clock_jump(self, set_back_s: float, time_s: float) -> None:
         self._flight.notes.append(
@@ -347,7 +352,9 @@ class _Reader:
             )
 
     def _record_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
-        vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # empty if the frame is too short
+        # The type follows the header (10 bytes, or 6 in MAVLink 1) and custom_mode. It is empty in a frame that is too
+        # short.
+        vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]
         if vehicle_type == bytes((MavType.GCS,)):
             self._flight.gcs_heartbeats.append(time_s)
             return
@@ -371,9 +378,9 @@ class _Reader:
     def _on_version(self, time_s: float, message: m.AutopilotVersion) -> None:
         self._capabilities = message.capabilities
         number = message.flight_sw_version
-        if number:
-            parts = ".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8))
-            self._flight.vehicle = f"{self._autopilot.firmware} {parts}"
+        if number:  # The bytes are major, minor, patch and type.
+            version = ".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8))
+            self._flight.vehicle = f"{self._autopilot.firmware} {version}"
 
     def _on_home(self, time_s: float, message: m.HomePosition) -> None:
         self._flight.set_home(time_s, message.latitude / _E7, message.longitude / _E7, message.altitude / 1e3)
@@ -491,6 +498,7 @@ class _Reader:
         self._flight.receiver(number).add(
             time_s,
             message.fix_type,
+            # UINT8_MAX satellites and a dilution of UINT16_MAX are unknown.
             NAN if message.satellites_visible == 0xFF else message.satellites_visible,
             NAN if message.eph == _U16 else message.eph / 100,
             message.h_acc / 1e3 if message.h_acc else NAN,

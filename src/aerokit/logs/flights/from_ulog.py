@@ -414,11 +414,11 @@ def _drop_damaged_rows(topics: list[Any]) -> int:
     last_us = max((int(times[-2]) for times in all_times if len(times) > 1), default=_MAX_TIME_US)
     damaged = 0
     for topic, times in zip(topics, all_times, strict=True):
-        before, after = numpy.append(times[:1], times[:-1]), numpy.append(times[1:], times[-1:])
+        previous_us, next_us = numpy.append(times[:1], times[:-1]), numpy.append(times[1:], times[-1:])
         # Rows have no checksum. A time is impossible if it is far outside the neighbours' times, or far after the end
         # of the log.
-        is_outlier = (times > after + _MAX_DISORDER_US) | (times < before - _MAX_DISORDER_US)
-        neighbours_agree = before <= after + _MAX_DISORDER_US  # otherwise one of them may be the outlier
+        is_outlier = (times > next_us + _MAX_DISORDER_US) | (times < previous_us - _MAX_DISORDER_US)
+        neighbours_agree = previous_us <= next_us + _MAX_DISORDER_US  # otherwise one of them may be the outlier
         is_damaged = (is_outlier & neighbours_agree) | (times > last_us + _MAX_LATE_US)
         if is_damaged.any():
             damaged += int(is_damaged.sum())
@@ -435,6 +435,7 @@ def _version(log: Any) -> str:
     release = log.msg_info_dict.get("ver_sw_release")
     if not isinstance(release, int) or not release:
         return Px4.name
+    # The bytes are major, minor, patch and type.
     return f"{Px4.name} {release >> 24 & 0xFF}.{release >> 16 & 0xFF}.{release >> 8 & 0xFF}"
 
 

@@ -30,7 +30,7 @@ class RecordedMission:
     MESSAGES = (
         m.MissionItemInt, m.MissionItem, m.MissionCount, m.MissionClearAll, m.MissionAck, m.FileTransferProtocol,
     )  # fmt: skip
-    """Classes of the messages that :meth:`add` takes."""
+    """Classes of the messages that :meth:`on_message` takes."""
 
     def __init__(self, system_id: int) -> None:
         self._system_id = system_id
@@ -74,9 +74,10 @@ class RecordedMission:
             self._is_file_open = ftp.data.rstrip(b"\0") == _MISSION_PATH
             self._file.clear()
             self._later_blocks.clear()
-        elif self._is_file_open and ftp.data and ftp.offset >= len(self._file):
+        elif self._is_file_open:
+            is_new = bool(ftp.data) and ftp.offset >= len(self._file)  # A repeated block begins in the known part.
             is_block_read = ftp.is_ack and ftp.request_opcode in _READING
-            if is_block_read or ftp.opcode == MavFtpOpcode.WRITEFILE:
+            if is_new and (is_block_read or ftp.opcode == MavFtpOpcode.WRITEFILE):
                 self._later_blocks[ftp.offset] = ftp.data
                 while block := self._later_blocks.pop(len(self._file), b""):
                     self._file += block

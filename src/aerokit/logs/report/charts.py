@@ -99,15 +99,15 @@ def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[in
         begin = count * piece // pieces
         end = count * (piece + 1) // pieces
         part = values[begin:end]
-        known = part
+        known_values = part
         if math.isnan(sum(part)):  # the sum is NaN if any value is unknown
-            known = [value for value in part if not math.isnan(value)]
+            known_values = [value for value in part if not math.isnan(value)]
             # Draw a gap only if most values of the part are unknown.
-            if len(known) * 2 < len(part):
+            if len(known_values) * 2 < len(part):
                 selected.add(next(row for row in range(begin, end) if math.isnan(values[row])))
-        if known:
-            selected.add(begin + part.index(min(known)))
-            selected.add(begin + part.index(max(known)))
+        if known_values:
+            selected.add(begin + part.index(min(known_values)))
+            selected.add(begin + part.index(max(known_values)))
     return sorted(selected)
 
 
@@ -244,15 +244,15 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
     boundaries = [0, *(bisect_left(times, change.time_s) for change in changes[1:]), len(places)]
     rows, deviation_m = track_rows_to_draw(places, keep=(row for row in boundaries if row < len(places)))
     rows_by_mode: dict[str, list[int | None]] = {}  # None interrupts the line
-    for (start, end), change in zip(pairwise(boundaries), changes, strict=True):
+    for (begin_row, end_row), change in zip(pairwise(boundaries), changes, strict=True):
         # The line of a mode ends at the first position of the next mode, so that the track has no gaps.
-        first, last = bisect_left(rows, start), bisect_left(rows, end)
-        part = rows[first : last + 1] if start < end else []
-        if part:
+        begin, end = bisect_left(rows, begin_row), bisect_left(rows, end_row)
+        line = rows[begin : end + 1] if begin_row < end_row else []
+        if line:
             mode_rows = rows_by_mode.setdefault(change.name, [])
             if mode_rows:  # the mode was used before
                 mode_rows.append(None)
-            mode_rows += part
+            mode_rows += line
     colours = mode_colours(flight)
     lines = [
         {
@@ -324,11 +324,12 @@ def _fence_traces(flight: FlightLog) -> list[dict[str, Any]]:
     end_s, parameter_at = flight.duration_s, flight.parameter_at
     radius = parameter_at("GF_MAX_HOR_DIST", end_s)  # PX4
     fence_type = parameter_at("FENCE_TYPE", end_s)  # ArduPilot; bit 1 is the circle
-    if parameter_at("FENCE_ENABLE", end_s) >= 1 and math.isfinite(fence_type) and int(fence_type) & 2:
+    has_circle = math.isfinite(fence_type) and int(fence_type) & 2
+    if parameter_at("FENCE_ENABLE", end_s) >= 1 and has_circle:
         radius = parameter_at("FENCE_RADIUS", end_s)
     if not 0 < radius < _MAX_FENCE_M:
         return []
-    angles = [math.tau * number / 90 for number in range(91)]
+    angles = [math.tau * number / 90 for number in range(91)]  # a polygon with 90 sides
     return [
         {
             "x": [round(radius * math.sin(angle), 1) for angle in angles],

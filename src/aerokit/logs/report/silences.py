@@ -55,14 +55,14 @@ def _pauses(pauses: list[Silence]) -> list[str]:
 
 def _sentence(flight: FlightLog, silence: Silence) -> str:
     is_at_end = silence.ends_s >= flight.duration_s
-    before = _state(flight, silence.begins_s)
+    state_before = _state(flight, silence.begins_s)
     text = f"Nothing was received from the vehicle for {duration_text(silence.ends_s - silence.begins_s)}"
     text += f" from {clock_text(silence.begins_s)} on"
     if is_at_end:
         text += ", until the log ends"
-    text += f"; it was last {before}." if before else "."
-    after = "" if is_at_end else _state(flight, silence.ends_s + _MODE_DELAY_S)
-    return f"{text} Afterwards it was {after}." if after else text
+    text += f"; it was last {state_before}." if state_before else "."
+    state_after = "" if is_at_end else _state(flight, silence.ends_s + _MODE_DELAY_S)
+    return f"{text} Afterwards it was {state_after}." if state_after else text
 
 
 def _state(flight: FlightLog, time_s: float) -> str:
@@ -84,10 +84,11 @@ def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
         return "How the vehicle reacts to a lost ground station is unknown."
     names = (*GCS_FAILSAFE_ACTIONS[firmware], *_OTHER_PARAMETERS[firmware])
     values = {name: value for name in names if not math.isnan(value := flight.parameter_at(name, time_s))}
-    if names[0] not in values:
+    deciding_name = names[0]  # Without its value, the others do not tell whether the vehicle reacts.
+    if deciding_name not in values:
         return (
-            f"How the vehicle reacts to a lost ground station is unknown, because the log does not contain {names[0]};"
-            f" look at {', '.join(names)}."
+            "How the vehicle reacts to a lost ground station is unknown, because the log does not contain"
+            f" {deciding_name}; look at {', '.join(names)}."
         )
     decisive_name, action = gcs_failsafe(firmware, values.get)
     texts = {name: f"{name} = {value:g}" for name, value in values.items()}

@@ -148,7 +148,7 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
         min_satellites=min(satellites, default=None),
         max_hdop=_max_or_none(hdops),
         max_vibration_m_s2=_max_or_none(vibrations),
-        clips=sum(max(after - before, 0.0) for before, after in pairwise(clips)) if clips else None,
+        clips=sum(max(later - earlier, 0.0) for earlier, later in pairwise(clips)) if clips else None,
         max_estimator_ratio=_max_or_none(estimator_ratios),
         lost_percent=spans.mean(flight.link, "lost_percent"),
     )
@@ -432,11 +432,11 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 def _failsafes_sentence(flight: FlightLog) -> str:
     acted, warnings, warning_kinds = [], [], []
     for failsafe in failsafes(flight):
-        at = f"{failsafe.title} at {clock_text(failsafe.time_s)}"
+        title_and_time = f"{failsafe.title} at {clock_text(failsafe.time_s)}"
         if failsafe.acted:
-            acted.append(f"{at} ({failsafe.reaction})")
+            acted.append(f"{title_and_time} ({failsafe.reaction})")
         else:
-            warnings.append(f"{at} ({failsafe.evidence[0].text})")
+            warnings.append(f"{title_and_time} ({failsafe.evidence[0].text})")
             warning_kinds.append(failsafe.kind)
     sentences = []
     if acted:

@@ -124,6 +124,7 @@ def _flags(camera: CameraDevice, stream: int) -> int:
 
 
 def _thermal_stream(camera: CameraDevice) -> int:
+    """Return the number of the stream with the thermal image, which is the last one."""
     return len(camera.streams)
 
 
@@ -207,7 +208,8 @@ class _CameraCommands:
         in_wrong_mode = _has_wrong_mode(camera, wrong_mode=CameraMode.VIDEO, unless_can=_CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
-        if not _selects_this_camera(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
+        has_valid_params = _selects_this_camera(command.param1) and interval_s >= 0 and count >= 0
+        if not has_valid_params or in_wrong_mode:
             return MavResult.DENIED
         single = (command.sender, sequence) if count == 1 and sequence > 0 else None
         # A single image with the same sender and sequence number is not taken again.
@@ -239,9 +241,10 @@ class _CameraCommands:
             return MavResult.DENIED
         if captures.is_busy or captures.is_recording:
             return MavResult.TEMPORARILY_REJECTED
+        # Param 2 of STORAGE_FORMAT is 1 to format the storage, param 3 is 1 to reset the image log.
         if command.param2 == 1.0:
             await camera.format_storage()
-        if command.param3 == 1.0:  # Param 3 of STORAGE_FORMAT is 1 to reset the image log.
+        if command.param3 == 1.0:
             captures.clear()
         return MavResult.ACCEPTED
 
@@ -260,7 +263,7 @@ class _CameraCommands:
         try:
             await camera.start_video()
         except BaseException as error:
-            self._was_cancelled = not isinstance(error, Exception)
+            self._was_cancelled = not isinstance(error, Exception)  # CancelledError is no subclass of Exception.
             raise
         # Param 2 of VIDEO_START_CAPTURE is the rate of CAMERA_CAPTURE_STATUS in Hz; 0 requests no status.
         status_interval_s = 1.0 / command.param2 if command.param2 else 0.0
@@ -335,7 +338,7 @@ class _CameraCommands:
         return MavResult.ACCEPTED
 
     async def reset_settings(self, command: ReceivedCommand) -> int:
-        if command.param1 == 1.0:
+        if command.param1 == 1.0:  # Param 1 of RESET_CAMERA_SETTINGS is 1 to reset all settings.
             await self._camera.reset_settings()
         return self._send_settings()
 

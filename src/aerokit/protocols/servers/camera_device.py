@@ -281,11 +281,11 @@ class Captures:
     def _recording_s(self) -> float:
         return 0.0 if self._recording_since is None else self._camera.host.now - self._recording_since
 
-    def _send_status_every(self, recording: float, interval_s: float) -> None:
+    def _send_status_every(self, recording_since: float, interval_s: float) -> None:
         def send_status() -> None:
-            if self._recording_since == recording:  # Another value means that this video has ended.
+            if self._recording_since == recording_since:  # Another value means that this video has ended.
                 self._camera.host.send(self.status())
-                self._send_status_every(recording, interval_s)
+                self._send_status_every(recording_since, interval_s)
 
         self._camera.host.call_later(interval_s, send_status)
 

@@ -288,12 +288,12 @@ class RunningCommands:
             running.cancel()
 
 
-def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
-    if command.confirmation == 0 or command.sender != first.sender:
+def _is_repeated(command: ReceivedCommand, earlier: ReceivedCommand) -> bool:
+    if command.confirmation == 0 or command.sender != earlier.sender:
         return False
-    pairs = zip(command.params, first.params, strict=True)
+    pairs = zip(command.params, earlier.params, strict=True)
     # NaN, which many commands use for a missing parameter, does not equal itself.
-    return all(param == earlier or (math.isnan(param) and math.isnan(earlier)) for param, earlier in pairs)
+    return all(param == old_param or (math.isnan(param) and math.isnan(old_param)) for param, old_param in pairs)
 
 
 def to_int(value: float) -> int:

@@ -12,6 +12,8 @@ from typing_extensions import Self
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
 
+_FOLDER_SIZE = 4096  # Linux reports this size for a small folder.
+
 
 class Entry(NamedTuple):
     """An entry of a folder. The size is in bytes, and None for a folder."""
@@ -229,7 +231,7 @@ class FileTree:
             mount, path_in_mount = mounted
             return mount.size(path_in_mount)
         node = self._find(path)
-        return 4096 if isinstance(node, dict) else node.size
+        return _FOLDER_SIZE if isinstance(node, dict) else node.size
 
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
         """Open a file. ``create`` creates a missing file and empties an existing one.

@@ -152,7 +152,7 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the state of a client, or None if too many clients have open files."""
         key = self._key(request, channel)
         if key not in self._clients and len(self._clients) >= self.max_clients:
-            idle_key = next((other for other, client in self._clients.items() if client.is_idle), None)
+            idle_key = next((client_key for client_key, client in self._clients.items() if client.is_idle), None)
             if idle_key is None:
                 return None
             del self._clients[idle_key]  # A client without open files makes room for the new one.
@@ -262,7 +262,7 @@ class SessionFtpServer(Generic[FilesT]):
 
         def close_if_due() -> None:
             if client.sessions.get(session.number) is not session:
-                return
+                return  # The session was closed before.
             due_at = client.used_at + self.session_timeout_s
             if self._host.now < due_at:  # The client has sent a request since this call was scheduled.
                 self._host.call_at(due_at, close_if_due)

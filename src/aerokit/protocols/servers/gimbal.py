@@ -32,7 +32,7 @@ _VERSION = 1 << 24
 
 
 Angles = tuple[float, float, float]
-_NOBODY = ComponentIds()
+_NO_COMPONENT = ComponentIds()
 
 
 class Place(NamedTuple):
@@ -61,9 +61,9 @@ class GimbalMount:
     limits: tuple[tuple[float, float], ...]
     """Minimum and maximum of roll, pitch and yaw in radians."""
     slew_rad_s: float
-    primary: ComponentIds = _NOBODY
+    primary: ComponentIds = _NO_COMPONENT
     """The component in control; zeros if none."""
-    secondary: ComponentIds = _NOBODY
+    secondary: ComponentIds = _NO_COMPONENT
     """The component in secondary control; zeros if none."""
     flags: int = 0
     """GIMBAL_MANAGER_FLAGS of the latest command."""
@@ -118,7 +118,7 @@ class GimbalMount:
 
     def is_in_control(self, sender: ComponentIds) -> bool:
         """Return True if this sender is in control."""
-        return sender in (self.primary, self.secondary) and sender != _NOBODY
+        return sender in (self.primary, self.secondary) and sender != _NO_COMPONENT
 
 
 def gimbal_manager_status(gimbal: GimbalMount) -> m.GimbalManagerStatus:
@@ -282,7 +282,7 @@ class GimbalRequests:
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
         # The sender is another manager, such as an autopilot. It may set the attitude if it is in control, or if no
         # component is.
-        if self._gimbal.primary in (_NOBODY, sender_of(message)):
+        if self._gimbal.primary in (_NO_COMPONENT, sender_of(message)):
             self._apply_attitude(message)
 
     def _apply_attitude(self, message: SetAttitude) -> None:
@@ -314,7 +314,7 @@ def _new_controller(current: ComponentIds, requested: ComponentIds, sender: Comp
     if _SENDER in requested:
         return sender
     if _RELEASE in requested:  # Only the component that has control can release it.
-        return _NOBODY if current == sender else current
+        return _NO_COMPONENT if current == sender else current
     if _UNCHANGED in requested:
         return current
     return requested

@@ -326,8 +326,8 @@ class MissionServer:
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
         """Called for an unexpected item."""
-        # An upload requests its expected item again anyway, so only a repeated last item is answered: like PX4
-        # (mavlink_mission.cpp, handle_mission_item_both), because its client has missed the answer.
+        # Like PX4 (mavlink_mission.cpp, handle_mission_item_both), answer only a repeated last item: its client has
+        # missed the answer. An upload in progress requests its expected item again anyway.
         client = sender_of(message)
         if client not in self._ended or any(upload.client == client for upload in self._uploads.values()):
             return
