@@ -356,6 +356,17 @@ def test_px4_truncates_files() -> None:
     assert vehicle.files.get("/t") == b"hel\0\0"
 
 
+@pytest.mark.parametrize("size", [4, 5, 261])
+def test_repeated_open_of_any_size_opens_one_session(size: int) -> None:
+    """The first byte of the answer is the low byte of the size. In a refusal, 5 means that no session is free."""
+    copter, ftp = copter_ftp()
+    copter.files.put("/t", bytes(size))
+    ftp.ask(Op.OPENFILERO, "/t")
+    ftp.send(Op.OPENFILERO, "/t", sequence=ftp.sequence)
+    assert [answer.opcode for answer in ftp.answers()] == [Op.ACK]
+    assert copter.ftp.open_sessions == 1
+
+
 def test_px4_repeats_small_answers_only() -> None:
     vehicle, ftp = px4_ftp()
     vehicle.files.put("/t", b"hello, world")

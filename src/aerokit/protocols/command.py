@@ -36,7 +36,7 @@ MAX_ATTEMPTS = 4
 class Repetition(NamedTuple):
     """Further effect of a repeated command.
 
-    With a ``param`` (1 to 7), the command has this effect only if that parameter equals ``value``.
+    With a ``param`` (1 to 4), the command has this effect only if that parameter equals ``value``.
     """
 
     effect: str

@@ -194,7 +194,8 @@ class SessionFtpServer(Generic[FilesT]):
     def _reply(self, client: ServedClient, answer: FtpPacket) -> None:
         # NOSESSIONSAVAILABLE is not stored: the client repeats its request until a session is free, and then needs a
         # new answer.
-        if answer.size <= self.max_stored_reply_size and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
+        lacks_session = answer.opcode == Op.NAK and answer.data[:1] == bytes([MavFtpErr.NOSESSIONSAVAILABLE])
+        if answer.size <= self.max_stored_reply_size and not lacks_session:
             client.reply = answer
         self._host.send(answer.message(), client.channel)
 
