@@ -294,6 +294,7 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
     """Write the mission into a document. Members that are unchanged since ``old`` are kept."""
     mission = document.setdefault("mission", {})
     if not mission:
+        # The altitude mode 1 means altitudes above home.
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
         old = None  # The document has no mission whose members could be kept.
     if old is None or plan.mission.items != old.mission.items:
