@@ -134,7 +134,8 @@ def _check_float(where: str, field: str, value: object, *, may_be_nan: bool) -> 
 
 def _fits_float32(value: float) -> bool:
     try:
-        return math.isfinite(struct.unpack("<f", struct.pack("<f", value))[0])
+        (rounded,) = struct.unpack("<f", struct.pack("<f", value))
+        return math.isfinite(rounded)
     except (OverflowError, struct.error):
         return False
 

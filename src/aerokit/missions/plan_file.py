@@ -111,7 +111,7 @@ def _document(plan: Plan) -> dict[str, Any]:
     """Return the JSON object of a .plan file. Unchanged parts of ``plan.source`` are kept."""
     document: dict[str, Any]
     if plan.source:
-        old = parse_plan(plan.source)  # It comes first, because it raises FileFormatError if the text is no plan.
+        old = parse_plan(plan.source)  # This call is first, because it raises FileFormatError if the text is no plan.
         document = json.loads(plan.source)
     else:
         document, old = _new_document(), None
