@@ -86,8 +86,10 @@ class FollowedTarget:
     def read(self) -> TargetState | None:
         if isinstance(self._target, HasTelemetry):
             self._read_vehicle(self._target.telemetry)
-        elif not isinstance(self._target, AsyncIterable) and (position := self._target()) is not None:
-            self.add(position)
+        elif not isinstance(self._target, AsyncIterable):
+            position = self._target()
+            if position is not None:
+                self.add(position)
         return self.latest
 
     def _read_vehicle(self, telemetry: Any) -> None:
@@ -327,8 +329,9 @@ class FollowStream(SteeringStream[TargetState]):
     def _stop_reason(self, lag: float) -> str | None:
         if self._end_reason:
             return self._end_reason
-        if math.inf > self.distance_m > self._max_distance_m:
-            return f"the target is {self.distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
+        distance_m = self.distance_m  # infinite while it is unknown
+        if self._max_distance_m < distance_m < math.inf:
+            return f"the target is {distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
         return super()._stop_reason(lag)
 
     def _zero_bearing_deg(self, state: TargetState) -> float:

@@ -143,7 +143,7 @@ class ParameterStore:
         frame = message.received_frame
         if frame is None or frame.component_id != self._transfers.component_id:
             return
-        if message.param_id == HASH_NAME or not message.param_id:
+        if message.param_id in ("", HASH_NAME):
             return  # The hash is sent like a parameter, but is not one.
         bytewise = self._was_bytewise = self.bytewise
         received = parameter_of(message, bytewise)
@@ -151,7 +151,8 @@ class ParameterStore:
         if old is None and len(self._known) >= MAX_PARAMETERS:
             return  # A faulty vehicle may send new names without end.
         stale = self.stale_value(name)
-        if old is not None and stale is not None and not same_value(received.value, old.value):
+        has_changed = old is not None and not same_value(received.value, old.value)
+        if has_changed and stale is not None:
             # This message is from before the last write, or another station has written the parameter.
             self._read_later(name, stale.ignored_until)
             if same_value(received.value, stale.value):
