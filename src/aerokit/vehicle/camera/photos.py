@@ -223,7 +223,7 @@ class PhotoInterval:
 
     def __init__(self, shutter: Shutter, seconds: float, count: int) -> None:
         self._shutter = shutter
-        self._seconds = seconds  # interval between two pictures
+        self._interval_s = seconds
         self._count = count  # number of ordered pictures; 0 for a series without an end
         self._link = shutter.link
         self._log = shutter.log
@@ -272,7 +272,7 @@ class PhotoInterval:
         self._set_newest(first_index - 1)
         self._known_reset_at = self._log.reset_at
         self._new_captures.__enter__()
-        await self._shutter.start_series(operation.order, self._seconds, self._count, status_before)
+        await self._shutter.start_series(operation.order, self._interval_s, self._count, status_before)
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         self._new_captures.__exit__()
@@ -310,7 +310,7 @@ class PhotoInterval:
             if self._received and self._next_index is not None:  # Later captures have arrived, but not the next one.
                 await self._fetch_next()
                 continue
-            patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # A picture may be late.
+            patience_s = max(2.0 * self._interval_s, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # A picture may be late.
             has_arrived = await self._new_captures.wait(patience_s)
             if has_arrived:
                 silent_checks = 0
@@ -371,7 +371,7 @@ class PhotoInterval:
         self._newest_at = self._link.now()
 
     def _max_new_captures(self) -> float:
-        return 2.0 * (self._link.now() - self._newest_at) / self._seconds + MAX_EXTRA_CAPTURES
+        return 2.0 * (self._link.now() - self._newest_at) / self._interval_s + MAX_EXTRA_CAPTURES
 
     def _is_plausible(self, index: int) -> bool:
         return index <= self._newest_index + self._max_new_captures()

@@ -210,8 +210,8 @@ class FollowStream(SteeringStream[TargetState]):
         Raises:
             SetpointStreamStopped: the stream has stopped; the error text has the reason.
         """
-        until = math.inf if duration_s is None else self._now() + duration_s
-        while (remaining_s := until - self._now()) > 0:
+        ends_at = math.inf if duration_s is None else self._now() + duration_s
+        while (remaining_s := ends_at - self._now()) > 0:
             self._raise_if_stopped()
             await anyio.sleep(min(remaining_s, POLL_INTERVAL_S))
         self._raise_if_stopped()
@@ -275,13 +275,13 @@ class FollowStream(SteeringStream[TargetState]):
             scope.cancel()
 
     async def _first_state(self) -> TargetState:
-        until = self._now() + self._valid_for_s
+        deadline = self._now() + self._valid_for_s
         while True:
             self._session.end.raise_if_ended()
             state = self._tracker.read()
             if state is not None and self._now() - state.reported_at <= self._valid_for_s:
                 return state
-            if self._now() > until or self._end_reason:
+            if self._now() > deadline or self._end_reason:
                 reason = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
                 raise OperationTimeout(f"follow: {reason}; the stream was not started")
             await anyio.sleep(POLL_INTERVAL_S)

@@ -105,8 +105,8 @@ class ValueStream(Generic[ValueT]):
 
     async def _supply_for(self, value: ValueT, duration_s: float) -> None:
         """Supply the value for ``duration_s`` seconds, so that it does not expire in this time."""
-        until = self._now() + duration_s
-        while (remaining_s := until - self._now()) > 0:
+        ends_at = self._now() + duration_s
+        while (remaining_s := ends_at - self._now()) > 0:
             self._set(value)
             await anyio.sleep(min(remaining_s, self._valid_for_s / 3))
         self._raise_if_stopped()

@@ -258,12 +258,12 @@ class Settings:
                 return self._with_definition(confirmed)
 
     async def _write_undefined(self, name: str, value: object, idle_timeout_s: float) -> Setting:
-        known = self._known.get(name)
-        if known is None or name in self._in_doubt:
+        present = self._known.get(name)
+        if present is None or name in self._in_doubt:
             answers = await self._read([name], idle_timeout_s)
-            known = _setting_or_raise(answers[name])
-        raw_value = checked_setting(name, value, known.type)
-        return await self._write(name, raw_value, known.type, known.value, idle_timeout_s)
+            present = _setting_or_raise(answers[name])
+        raw_value = checked_setting(name, value, present.type)
+        return await self._write(name, raw_value, present.type, present.value, idle_timeout_s)
 
     async def _write_defined(
         self, setting_definition: SettingDefinition, value: object, idle_timeout_s: float
@@ -275,9 +275,9 @@ class Settings:
         await self._read_before_write(definition, setting_definition, idle_timeout_s)
         # Check the value again, because the values that were just read may exclude or restrict this setting.
         checked_value = definition.checked(name, value, self._values())
-        known = self._known.get(name)
-        wire_type = setting_definition.wire_type if known is None else known.type
-        old_value = None if known is None else known.value
+        present = self._known.get(name)
+        wire_type = setting_definition.wire_type if present is None else present.type
+        old_value = None if present is None else present.value
         raw_value = checked_setting(name, checked_value, wire_type)
         return await self._write(name, raw_value, wire_type, old_value, idle_timeout_s)
 

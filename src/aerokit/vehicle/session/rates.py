@@ -318,7 +318,7 @@ class MessageRates:
 
     def _check_stream(self, stream: _Stream) -> None:
         stream.counts_at_checks.append(stream.received)
-        if stream.requested_hz is None or stream.requested_hz <= 0:
+        if stream.requested_hz is None or stream.requested_hz <= 0:  # There is no rate to compare with.
             return
         if stream.counts_at_checks[-1] == stream.counts_at_checks[0]:  # No message has arrived in the window.
             self._retry_if_due(stream)

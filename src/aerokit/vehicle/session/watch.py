@@ -288,7 +288,7 @@ class VehicleWatch:
 
     def _on_held_back_frame(self, frame: Frame) -> None:
         """Compare the clock in a frame that arrived after a loss of the link with the clock before the loss."""
-        if not self._lost_clocks:  # There is no clock to compare with.
+        if not self._lost_clocks:  # Without a clock to compare with, a reboot is assumed.
             self._on_reboot_detected({})
             return
         if self._first_held_back_at is None:

@@ -246,7 +246,7 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None
 
-    earlier = [entry for entry in context.before or () if entry.icao != message.ICAO_address]
+    earlier = [entry for entry in context.previous_value or () if entry.icao != message.ICAO_address]
     reported = Aircraft(
         icao=message.ICAO_address,
         callsign=message.callsign.strip() if message.flags & AdsbFlags.VALID_CALLSIGN else "",

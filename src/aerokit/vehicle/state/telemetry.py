@@ -244,7 +244,7 @@ class Telemetry(States):
             cell.set(value, source)
 
         def update_with_context(message: Any, source: Source) -> None:
-            context.before = cell.latest
+            context.previous_value = cell.latest
             value = decode(message, context)
             if value is not None:
                 # A message older than the value is not dropped, because the value may combine several message types.
