@@ -144,9 +144,9 @@ class _Rules:
 
 
 def _is_time(parameter: inspect.Parameter) -> bool:
-    name = parameter.name
-    is_speed = name.endswith(("m_s", "deg_s"))
-    return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
+    is_speed = parameter.name.endswith(("m_s", "deg_s"))
+    has_time_name = parameter.name.endswith(("timeout", "_s")) and not is_speed
+    return has_time_name and str(parameter.annotation) in _SECONDS
 
 
 def _error(rule: Rule, argument: str, value: object, vehicle_parameter: object) -> InvalidArgument:
@@ -250,7 +250,10 @@ def _has_class_name(name: str, value: object) -> bool:
 
 
 def _is_class(names: tuple[str, ...], value: object) -> bool:
-    return isinstance(value, type) and (not names or any(cls.__name__ in names for cls in value.__mro__))
+    """Return True if the value is a class with one of the names, or derived from one; any class if there are none."""
+    if not isinstance(value, type):
+        return False
+    return not names or any(cls.__name__ in names for cls in value.__mro__)
 
 
 def _is_mapping(is_key: Check, is_value: Check, value: object) -> bool:
@@ -261,8 +264,9 @@ def _are_items(is_item: Check, value: object) -> bool:
     # A string is an iterable of characters, but no caller intends that.
     if isinstance(value, (str, bytes, bytearray)) or not isinstance(value, Iterable):
         return False
-    # The items of other iterables are not checked, because that would exhaust an iterator.
-    return not isinstance(value, (list, tuple, set, frozenset)) or all(map(is_item, value))
+    if not isinstance(value, (list, tuple, set, frozenset)):
+        return True  # The iterable may be an iterator, which checking its items would exhaust.
+    return all(map(is_item, value))
 
 
 def check_kind(name: str, value: object, expected_type: type) -> None:
@@ -279,7 +283,8 @@ def check_range(name: str, value: float, minimum: float, maximum: float, *, abov
     With ``above``, ``minimum`` itself is not allowed.
     """
     try:
-        is_allowed = minimum <= value <= maximum and not (above and value == minimum)
+        is_high_enough = value > minimum if above else value >= minimum
+        is_allowed = is_high_enough and value <= maximum
     except TypeError:
         is_allowed = False
     if not is_allowed:

@@ -104,16 +104,18 @@ class ReadOnly:
     def __setattr__(self, name: str, value: object) -> None:
         """Refuse to set an attribute that reports the vehicle's state. Set any other attribute."""
         attribute = inspect.getattr_static(type(self), name, None)
-        is_setter = isinstance(attribute, property) and attribute.fset is not None
+        is_private = name.startswith("_")
+        has_setter = isinstance(attribute, property) and attribute.fset is not None
+        is_method = callable(attribute)  # A program may replace a method, for example by a mock.
+        # An attribute without a descriptor is set by the constructor, or added by the program.
         is_descriptor = hasattr(type(attribute), "__get__")
-        # A program may replace a method, for example by a mock. An attribute without a descriptor is set by the
-        # constructor, or added by the program.
-        if name.startswith("_") or is_setter or callable(attribute) or not is_descriptor:
+        if is_private or has_setter or is_method or not is_descriptor:
             object.__setattr__(self, name, value)
             return
         text = f"{type(self).__name__}.{name} = {short_repr(value)} is not allowed"
-        call = _SETTER_CALLS.get(name)
-        if call is None or not hasattr(type(self), call.partition("(")[0]):
+        call = _SETTER_CALLS.get(name, "")
+        setter, _, _ = call.partition("(")
+        if not setter or not hasattr(type(self), setter):
             raise AttributeError(f"{text}: this attribute is read-only")
         wait = "" if type(self).__module__.startswith("aerokit.sync") else "await "
         replacement = f"{wait}….{call.format(value=short_repr(value))}"

@@ -54,7 +54,7 @@ def wrap_360(angle_deg: float) -> float:
 
 def wrap_longitude(longitude_deg: float) -> float:
     """Convert a longitude to the range from -180 to below 180."""
-    return wrap_360(longitude_deg + 180.0) - 180.0 if not -180.0 <= longitude_deg < 180.0 else longitude_deg
+    return longitude_deg if -180.0 <= longitude_deg < 180.0 else wrap_360(longitude_deg + 180.0) - 180.0
 
 
 def _wgs84() -> Geodesic:

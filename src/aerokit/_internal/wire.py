@@ -37,7 +37,8 @@ class _FrameFields:
     __slots__ = ("_body", "_raw", "checksum", "component_id", "message_id", "received_at", "system_id")
 
 
-# The compiled `body` is computed from `_raw` when it is first read. The framer in Python sets `_body` of each frame.
+# In the extension, `body` is computed from `_raw` when it is first read. In Python, it is another name of the slot
+# `_body`, which the framer sets for each frame.
 _FrameFields.body = _FrameFields._body  # type: ignore[attr-defined]
 
 

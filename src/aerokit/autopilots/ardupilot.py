@@ -287,7 +287,7 @@ class ArduCopter(ArduPilot):
         return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
-        # STANDBY means on the ground, ACTIVE in the air. During a failsafe, CRITICAL replaces both.
+        # STANDBY means on the ground, ACTIVE in the air. CRITICAL, the state in a failsafe, may mean either.
         return _landed_state(heartbeat)
 
     def return_altitude_parameters(self, *, is_vtol: bool) -> tuple[tuple[str, float], ...]:

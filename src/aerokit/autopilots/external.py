@@ -74,6 +74,7 @@ def _external_navigation(quantity: str) -> ExternalRule:
     return ExternalRule(required=((("VISO_TYPE",), (1.0, 2.0, 3.0)),), sole_source=sole_source)
 
 
+# In EK3_SRC1_POSXY and EK3_SRC2_POSXY, 3 is GPS, and 0 is none.
 _GPS_ALONE = (("EK3_SRC1_POSXY", (3.0,)), ("EK3_SRC2_POSXY", (0.0, 3.0)), ("GPS2_TYPE", (0.0,)))
 
 # The values in `required` make ArduPilot read the sensor over MAVLink, e.g. GPS1_TYPE 14.
@@ -98,7 +99,7 @@ ARDUPILOT_EXTERNAL = ExternalRules(
 # Bits of EKF2_GPS_CTRL: 1 position, 2 altitude, 4 velocity.
 _EV_ANY = tuple(float(bits) for bits in range(1, 16))
 _EV_VELOCITY = tuple(bits for bits in _EV_ANY if int(bits) & 4)
-_NO_GPS_POSITION = tuple(float(bits) for bits in range(0, 16, 2))
+_NO_GPS_POSITION = tuple(float(bits) for bits in range(16) if not bits & 1)
 _VISION_ALONE = (
     ("EKF2_EV_CTRL", tuple(bits for bits in _EV_ANY if int(bits) & 1)),
     ("EKF2_GPS_CTRL", _NO_GPS_POSITION),

@@ -105,5 +105,5 @@ _TEXT_PATTERNS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
 def failsafe_kind(text: str) -> str | None:
     """Return the kind (such as ``"battery"``) if a text reports the beginning of a failsafe; otherwise None."""
     if _NO_EVIDENCE_PATTERN.search(text) is not None:
-        return None
+        return None  # The text reports for example that a failsafe ended, or that a pre-arm check fails.
     return next((kind for pattern, kind in _TEXT_PATTERNS if pattern.search(text)), None)

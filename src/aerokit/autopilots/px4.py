@@ -194,8 +194,8 @@ class Px4(Autopilot):
 
     def find_mode(self, mode: str | int | Mode, reported_names: Mapping[int, str] = NO_MODES) -> Mode:
         """Find a mode by name or number. External modes are also found by their registered names."""
-        numbered = super().find_mode(mode, reported_names)
-        return Mode(reported_names.get(numbered.custom_mode, numbered.name), numbered.custom_mode)
+        found_mode = super().find_mode(mode, reported_names)
+        return Mode(reported_names.get(found_mode.custom_mode, found_mode.name), found_mode.custom_mode)
 
     def mode_order(self, mode: Mode) -> ModeOrder:
         # param2 is the main mode, param3 the sub mode.

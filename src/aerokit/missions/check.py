@@ -40,8 +40,8 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
     check_count(len(items), home_is_item_0=bool(home_is_item_0))
     for index, item in enumerate(items):
         check_item(item, f"item {index}", mission_type)
-        if home_is_item_0 is False and item.command in DESTINATIONS and item.x == item.y == 0:
-            # In an item for ArduPilot, 0°, 0° means the current position.
+        means_current_position = item.command in DESTINATIONS and item.x == item.y == 0  # on ArduPilot
+        if means_current_position and home_is_item_0 is False:
             raise InvalidArgument(
                 f"item {index} ({item.name}): x, y = 0, 0 is not allowed: only ArduPilot understands it as the current"
                 " position; give a latitude and a longitude"
@@ -134,7 +134,8 @@ def _check_float(where: str, field: str, value: object, *, may_be_nan: bool) -> 
 
 def _fits_float32(value: float) -> bool:
     try:
-        return math.isfinite(struct.unpack("<f", struct.pack("<f", value))[0])
+        (rounded,) = struct.unpack("<f", struct.pack("<f", value))
+        return math.isfinite(rounded)
     except (OverflowError, struct.error):
         return False
 
@@ -145,7 +146,8 @@ def _check_place(where: str, item: MissionItem) -> None:
         value = getattr(item, field)
         if not isinstance(value, int) or isinstance(value, bool):
             raise _wrong(where, field, value, "an integer, because MISSION_ITEM_INT has no fraction there")
-        if scale == DEGREE_SCALE and abs(value) > limit * scale and value != DEFAULT_XY:
+        is_outside = value != DEFAULT_XY and abs(value) > limit * scale
+        if is_outside and scale == DEGREE_SCALE:
             allowed = f"a {name} of -{limit} to {limit} degrees in 1e-7 degrees; this is {value / 1e7:g} degrees"
             raise _wrong(where, field, value, allowed)
         if not -0x80000000 <= value <= 0x7FFFFFFF:

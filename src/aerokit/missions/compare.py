@@ -134,14 +134,15 @@ _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000
 
 def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
     """Yield the values that a field may have when the item is read back."""
-    number, value = FIELDS.index(field), getattr(item, field)
-    forms: list[str] = []  # Each form has a letter for each field.
+    field_index, value = FIELDS.index(field), getattr(item, field)
+    forms: list[str] = []
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         forms += _ARDUPILOT_FORMS.get(item.command, ("",))
     if storage in (ItemStorage.PX4, ItemStorage.ANY):
         forms.append(_px4_form(item))
     for form in forms:
-        stored = _stored_as(form[number : number + 1] or "-", value)
+        letter = form[field_index] if field_index < len(form) else "-"
+        stored = _stored_as(letter, value)
         if stored is not None:
             yield stored
 
@@ -201,9 +202,9 @@ def _finite_stored_as(letter: str, value: float) -> float | None:
     return stored
 
 
-ALTITUDE_TOLERANCE_M = 0.011  # ArduPilot stores altitudes in whole centimetres
+ALTITUDE_TOLERANCE_M = 0.011  # ArduPilot stores altitudes in whole centimetres.
 
-HEADING_TOLERANCE_DEG = 0.001  # PX4 stores radians
+HEADING_TOLERANCE_DEG = 0.001  # PX4 stores radians.
 
 _HEADING_IS_PARAM4 = frozenset(
     {
@@ -299,10 +300,11 @@ def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage
     value, actual_value = getattr(expected, field), getattr(actual, field)
     if _close(value, actual_value):
         return True
-    if field == "param4" and expected.command in _HEADING_IS_PARAM4 and storage in (ItemStorage.PX4, ItemStorage.ANY):
-        # The number is a heading, so 359.9995 and 0 are close to each other.
-        turn = abs(value - actual_value) % 360.0
-        if min(turn, 360.0 - turn) <= HEADING_TOLERANCE_DEG:
+    is_heading = field == "param4" and expected.command in _HEADING_IS_PARAM4
+    if is_heading and storage in (ItemStorage.PX4, ItemStorage.ANY):
+        # The headings 359.9995° and 0° are close to each other.
+        difference_deg = abs(value - actual_value) % 360.0
+        if min(difference_deg, 360.0 - difference_deg) <= HEADING_TOLERANCE_DEG:
             return True
     return any(_close(stored, actual_value) for stored in _stored_values(expected, field, storage))
 

@@ -224,24 +224,26 @@ def _return_item(place: Position) -> MissionItem:
     return item.replace(z=place.altitude_amsl_m or 0.0)
 
 
-def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
-    """Return the polygon whose vertices begin at item ``first``.
+def _read_polygon(items: Sequence[MissionItem], first_index: int) -> FencePolygon:
+    """Return the polygon whose vertices begin at item ``first_index``.
 
     Raises RemoteProtocolError if vertices are missing.
     """
-    item = items[first]
+    item = items[first_index]
     # On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
     count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0  # A polygon has at least 3 vertices.
-    vertices = items[first : first + count]
+    vertices = items[first_index : first_index + count]
     if not count:
         raise RemoteProtocolError(
-            f"item {first} ({item.name}) begins a polygon of {item.param1:g} vertices, but 3 to 65535 are possible"
+            f"item {first_index} ({item.name}) begins a polygon of {item.param1:g} vertices,"
+            " but 3 to 65535 are possible"
         )
     if len(vertices) < count or any(vertex.command != item.command for vertex in vertices):
         raise RemoteProtocolError(
-            f"item {first} ({item.name}) begins a polygon of {item.param1:g} vertices, but some of them are missing"
+            f"item {first_index} ({item.name}) begins a polygon of {item.param1:g} vertices,"
+            " but some of them are missing"
         )
-    places = [_place(vertex, first + number) for number, vertex in enumerate(vertices)]
+    places = [_place(vertex, index) for index, vertex in enumerate(vertices, first_index)]
     is_inclusion = item.command == MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION
     return FencePolygon(places, is_inclusion)
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.position import Home, Position
 
-_MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
-_MAX_METRES = 65_535.0  # ArduPilot stores metres in 16 bits
+_MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits.
+_MAX_METRES = 65_535.0  # ArduPilot stores metres in 16 bits.
 # Value of parameters that have no meaning in a command, or that the functions below leave at their default.
 _UNSET = 0.0
 

@@ -111,7 +111,7 @@ def _document(plan: Plan) -> dict[str, Any]:
     """Return the JSON object of a .plan file. Unchanged parts of ``plan.source`` are kept."""
     document: dict[str, Any]
     if plan.source:
-        old = parse_plan(plan.source)  # It comes first, because it raises FileFormatError if the text is no plan.
+        old = parse_plan(plan.source)  # This call is first, because it raises FileFormatError if the text is no plan.
         document = json.loads(plan.source)
     else:
         document, old = _new_document(), None
@@ -294,6 +294,7 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
     """Write the mission into a document. Members that are unchanged since ``old`` are kept."""
     mission = document.setdefault("mission", {})
     if not mission:
+        # The altitude mode 1 means altitudes above home.
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
         old = None  # The document has no mission whose members could be kept.
     if old is None or plan.mission.items != old.mission.items:

@@ -81,10 +81,11 @@ def read_xyz(value: JsonValue) -> tuple[int, int, float]:
     return x, y, altitude.number()
 
 
+# Maps the ``AltitudeMode`` of an item to its frame.
 _FRAME_OF_MODE = {
     1: MavFrame.GLOBAL_RELATIVE_ALT,
     2: MavFrame.GLOBAL,
-    3: MavFrame.GLOBAL,
+    3: MavFrame.GLOBAL,  # See `_planned_altitude`.
     4: MavFrame.GLOBAL_TERRAIN_ALT,
 }
 
@@ -194,9 +195,9 @@ def _jump_ids(entries: Sequence[_Entry]) -> dict[int, int]:
     """Map each doJumpId in a .plan file to the index of the mission item that has this id."""
     ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
-    first = 0
+    first_index = 0
     for entry in entries:
-        for index, value in enumerate(entry.simple_items, first):
+        for index, value in enumerate(entry.simple_items, first_index):
             member = value.child("doJumpId")
             jump_id = index + 1 if member is None else member.integer(-1, 2**31)
             has_own_entry = value is entry.value
@@ -204,7 +205,7 @@ def _jump_ids(entries: Sequence[_Entry]) -> dict[int, int]:
                 ids_of_entries.setdefault(jump_id, index)
             else:
                 ids_in_surveys.setdefault(jump_id, index)
-        first += entry.size
+        first_index += entry.size
     # If an item inside a survey and an item with an entry of its own have the same id, the item with the entry is used.
     return ids_in_surveys | ids_of_entries
 
@@ -260,13 +261,14 @@ def _items_with_id(entry: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _set_jump_ids(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[MissionItem]) -> None:
     """Number the items from 1 (doJumpId), and set jump targets to these numbers."""
-    first = 0
+    first_index = 0
     for entry, size in zip(entries, sizes):  # noqa: B905 - same length
-        for index, simple_item in enumerate(_items_with_id(entry), first):
+        for index, simple_item in enumerate(_items_with_id(entry), first_index):
             simple_item["doJumpId"] = index + 1
             if simple_item["command"] == MavCmd.DO_JUMP:
-                simple_item["params"][0] = json_number(items[index].param1 + 1)
-        first += size
+                target_index = items[index].param1
+                simple_item["params"][0] = json_number(target_index + 1)
+        first_index += size
 
 
 def load_json(text: str, name: str) -> JsonValue:

@@ -172,7 +172,7 @@ class CameraDefinition(Snapshot):
                 if restriction.setting != name or not _evaluate(restriction.condition, values):
                     continue
                 allowed = restriction.options
-                if reasons:  # Only options that every restriction allows remain.
+                if reasons:  # An earlier restriction applies as well, so only options that all of them allow remain.
                     previous_keys = {setting_key(option.value) for option in options}
                     allowed = tuple(option for option in allowed if setting_key(option.value) in previous_keys)
                 options = allowed
@@ -291,11 +291,11 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
         raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: it must be {lowest}..{highest}")
     # An integer must be a multiple of the step, counted from the minimum.
     if isinstance(number, int) and isinstance(step, int) and step > 1:
-        first = low if isinstance(low, int) else 0
-        if (number - first) % step:
+        base = low if isinstance(low, int) else 0
+        if (number - base) % step:
             raise InvalidArgument(
-                f"{setting.name} = {short_repr(value)} is not allowed: it must be {first}, {first + step},"
-                f" {first + 2 * step} …"
+                f"{setting.name} = {short_repr(value)} is not allowed: it must be {base}, {base + step},"
+                f" {base + 2 * step} …"
             )
     return number
 
@@ -342,18 +342,18 @@ def _evaluate(condition: str, values: Values) -> bool:
 
 def _compare(value: SettingValue, operator: str, text: str) -> bool:
     """Evaluate one test. Comparing a number with a text gives False."""
-    other = text if isinstance(value, (str, bytes)) else number_or_none(text)
-    if other is None:
+    operand = text if isinstance(value, (str, bytes)) else number_or_none(text)
+    if operand is None:
         return False
     # Do not use ==, because a value sent as a 32-bit float differs a little from the decimal number in the file.
-    is_equal = settings_equal(value, other)
+    is_equal = settings_equal(value, operand)
     if operator in ("=", "!="):
         return is_equal if operator == "=" else not is_equal
-    if isinstance(value, (str, bytes)) or isinstance(other, str):  # Texts have no order.
+    if isinstance(value, (str, bytes)) or isinstance(operand, str):  # Texts have no order.
         return False
     if is_equal:
         return operator in (">=", "<=")
-    return value > other if operator in (">", ">=") else value < other
+    return value > operand if operator in (">", ">=") else value < operand
 
 
 # ----------------------------------------------------------------------------------------- the file

@@ -244,6 +244,7 @@ def _add_value(file: ParameterFile, place: str, name: str, text: str, kind: Para
 
 
 def _directive_hint(fields: list[str]) -> str:
+    # In ArduPilot's default files, lines are also `@include FILE` or `NAME VALUE @READONLY`.
     if any(field.startswith("@") for field in (*fields[:1], *fields[2:])):
         return " (@include and @READONLY in ArduPilot's default files are not supported)"
     return ""

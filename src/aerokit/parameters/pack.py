@@ -189,15 +189,16 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     if common_length > len(previous_name) or common_length + own_length > NAME_LENGTH:
         raise _damaged(position, f"invalid name length {common_length} + {own_length} after {previous_name!r}")
     format_ = _FORMATS[code]
-    start = position + 2 + own_length
-    end = start + format_.size * (2 if has_default else 1)
+    name_start = position + 2  # after the byte with the type and flags, and the byte with the lengths
+    value_start = name_start + own_length
+    end = value_start + format_.size * (2 if has_default else 1)
     if end > len(data):
         return None
-    (value,) = format_.unpack_from(data, start)
+    (value,) = format_.unpack_from(data, value_start)
     default = None
     if has_default:
-        (default,) = format_.unpack_from(data, start + format_.size)
-    name = previous_name[:common_length] + data[position + 2 : start]
+        (default,) = format_.unpack_from(data, value_start + format_.size)
+    name = previous_name[:common_length] + data[name_start:value_start]
     return PackEntry(name, _STORED_TYPES[code], value, default, end)
 
 

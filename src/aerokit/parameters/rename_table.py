@@ -124,11 +124,11 @@ _OLDER_ALL = ("Copter", "Plane", "Rover", "Sub")
 _OLDER_COPTER, _OLDER_PLANE, _ROVER = ("Copter",), ("Plane",), ("Rover",)
 
 
-def _moved(old: str, new: str, names: str) -> str:
+def _moved(prefix: str, new_prefix: str, names: str) -> str:
     """Make pairs of names by adding prefixes: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``."""
     # A name may also be a pair such as ``A>B``.
     halves = (name.partition(">") for name in names.split())
-    return " ".join(f"{old}{old_name}>{new}{new_name or old_name}" for old_name, _, new_name in halves)
+    return " ".join(f"{prefix}{old}>{new_prefix}{new or old}" for old, _, new in halves)
 
 
 _XYZ = ["X", "Y", "Z"]

@@ -91,8 +91,8 @@ class Renamed(Snapshot):
         cannot have, such as NaN or a fraction of a bit mask, is returned unchanged.
         """
         converted = self._convert(value, from_name=self.requested)
-        is_integer = type is not None and type.is_integer
-        return round(converted) if is_integer and self._is_scaled and math.isfinite(converted) else converted
+        is_scaled_integer = self._is_scaled and type is not None and type.is_integer
+        return round(converted) if is_scaled_integer and math.isfinite(converted) else converted
 
     def to_requested(self, value: float) -> int | float:
         """Convert a value of the vehicle to the program's units."""

@@ -76,10 +76,10 @@ class ParameterTable(Mapping[str, Parameter]):
         Raises:
             ValueUnknownError: no default is known, because the list protocol does not report defaults.
         """
-        known = [parameter for parameter in self._by_name.values() if parameter.default is not None]
-        if self._by_name and not known:
+        with_default = [parameter for parameter in self._by_name.values() if parameter.default is not None]
+        if self._by_name and not with_default:
             raise ValueUnknownError("no default is known: only a download by MAVFTP reports defaults")
-        return ParameterTable(parameter for parameter in known if parameter.is_changed)
+        return ParameterTable(parameter for parameter in with_default if parameter.is_changed)
 
     def updated_with(self, parameters: Iterable[Parameter]) -> ParameterTable:
         """Return a copy with these parameters: known parameters are replaced, new ones appended.

@@ -218,7 +218,7 @@ async def _attached(
         was_left_by_exception = True
         raise
     finally:
-        was_flight_abandoned = True  # It stays true if `finish` is cancelled.
+        was_flight_abandoned = True  # The value if `finish` is cancelled.
         try:
             was_flight_abandoned = await context.finish()
         finally:

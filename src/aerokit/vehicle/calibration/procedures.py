@@ -285,8 +285,8 @@ RADIO_COMMAND_RESULTS = (MavResult.UNSUPPORTED,)
 async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
     run.check_ready()
     channels = run.session.telemetry.cells["rc_channels"]
-    lows: dict[int, int] = {}
-    highs: dict[int, int] = {}
+    lows: dict[int, int] = {}  # the shortest pulse of each channel in µs
+    highs: dict[int, int] = {}  # the longest pulse of each channel in µs
     with ExitStack() as cleanup:
         cleanup.enter_context(run.session.streaming("rc_channels"))
 
@@ -336,7 +336,9 @@ def _radio_parameters(run: CalibrationRun, ranges: dict[int, tuple[int, int, int
     """Check the lowest, center and highest pulse of each channel, and return them as parameters."""
     values: dict[str, float] = {}
     for number, (low, trim, high) in ranges.items():
-        if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
+        is_ordered = LOWEST_US <= low <= trim <= high <= HIGHEST_US
+        spans_middle = low < MIDDLE_US < high
+        if not is_ordered or not spans_middle:
             raise run.failure(
                 f"channel {number} ranges from {low} to {high} µs with a center of {trim} µs; its minimum must be from"
                 f" {LOWEST_US} to {MIDDLE_US} µs, its maximum from {MIDDLE_US} to {HIGHEST_US} µs, and its center"

@@ -78,7 +78,9 @@ def capture_of(message: Any, camera: int, received_at: float, telemetry: Telemet
     """Decode a message about a picture. Call it as soon as the message arrives."""
     if message.NAME == "CAMERA_TRIGGER":
         return from_trigger(message, camera, received_at, telemetry)
-    return (from_feedback if message.NAME == "CAMERA_FEEDBACK" else from_image)(message, camera, received_at)
+    if message.NAME == "CAMERA_FEEDBACK":
+        return from_feedback(message, camera, received_at)
+    return from_image(message, camera, received_at)
 
 
 def from_image(message: CameraImageCaptured, camera: int, received_at: float) -> Capture:
@@ -216,7 +218,7 @@ def captures_csv(captures: Iterable[Capture]) -> str:
         time = _time_of(capture)
         taken_at = "" if time is None else time.isoformat(timespec="milliseconds")
         success = "" if capture.success is None else int(capture.success)
-        name = capture.file_url.rpartition("/")[2]
+        _, _, name = capture.file_url.rpartition("/")
         angles = (capture.roll_deg, capture.pitch_deg, capture.yaw_deg)
         row = (name, capture.camera, capture.index, success, taken_at, *coordinates, *angles)
         writer.writerow("" if value is None else value for value in row)
@@ -296,7 +298,8 @@ def _split(jpeg: bytes) -> tuple[list[bytes], bytes]:
     if jpeg[:3] != bytes((0xFF, START, 0xFF)):
         raise FileFormatError("the picture is not a JPEG: its bytes do not begin with FF D8 FF")
     segments = list(_segments(jpeg))
-    return segments, jpeg[2 + sum(map(len, segments)) :]
+    image_start = 2 + sum(map(len, segments))  # The segments follow the bytes FF D8.
+    return segments, jpeg[image_start:]
 
 
 def _segments(jpeg: bytes) -> Iterator[bytes]:
@@ -313,7 +316,8 @@ def _segments(jpeg: bytes) -> Iterator[bytes]:
 
 
 def _is_exif(segment: bytes) -> bool:
-    return segment[1] == EXIF and segment[4:10] == EXIF_HEADER
+    marker, content = segment[1], segment[4:]  # See `_segments`.
+    return marker == EXIF and content.startswith(EXIF_HEADER)
 
 
 def _pillow(module: str) -> Any:
@@ -358,10 +362,10 @@ def _gps_tags(capture: Capture) -> dict[int, Any]:
 
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
     """Return degrees, minutes and seconds, without the sign."""
-    ten_thousandths = round(abs(degrees) * 36_000_000)  # the angle in units of 1/10,000 arc second, which is 3 mm
-    total_minutes, rest = divmod(ten_thousandths, 60 * 10_000)
+    units_per_second = 10_000  # A unit of 1/10,000 arc second is 3 mm.
+    total_minutes, units = divmod(round(abs(degrees) * 3600 * units_per_second), 60 * units_per_second)
     whole_degrees, minutes = divmod(total_minutes, 60)
-    return float(whole_degrees), float(minutes), rest / 10_000
+    return float(whole_degrees), float(minutes), units / units_per_second
 
 
 def _time_of(capture: Capture) -> datetime | None:

@@ -335,10 +335,10 @@ class StorageMixin(CameraMixin):
         """
         await self._link.identify()
         self._media.clear()  # Media that were reported earlier may have changed.
-        first = await self._link.request(m.StorageInformation, 0)  # 0 requests all media, one message for each.
-        if first is None:
+        answer = await self._link.request(m.StorageInformation, 0)  # 0 requests all media, one message for each.
+        if answer is None:
             raise self._link.timeout_error("reported no storage")
-        for number in range(1, first.storage_count + 1):
+        for number in range(1, answer.storage_count + 1):
             if number not in self._media:
                 await self._request_medium(number)
         return self.storage.value

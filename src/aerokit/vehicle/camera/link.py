@@ -117,7 +117,7 @@ class CameraLink(CameraOrders):
         information = self.information._latest
         model = "" if information is None else f"{information.vendor} {information.model}".strip()
         model = "".join(character for character in model if character.isprintable())
-        return f"camera {self.number}{f' ({model})' if model else ''}"
+        return f"camera {self.number} ({model})" if model else f"camera {self.number}"
 
     def bind(self, number: int, *, is_guess: bool = False) -> None:
         """Use the camera with this number. A guess is replaced by a later call, unless it has been given orders."""
@@ -258,7 +258,8 @@ class CameraLink(CameraOrders):
 
         def on_message(message: Any) -> None:
             frame = message.received_frame
-            if frame is not None and frame.component_id == component_id and self._is_from_this_camera(message):
+            is_from_component = frame is not None and frame.component_id == component_id
+            if is_from_component and self._is_from_this_camera(message):
                 # Other messages do not prove that there is a camera: PX4 sends STORAGE_INFORMATION about its own card.
                 if message_type.NAME.startswith("CAMERA_"):
                     self._is_number_confirmed.set()

@@ -120,17 +120,18 @@ class Shutter:
             )
 
     async def _fetch_missed(
-        self, before: CameraStatus | None, status: CameraStatus, old_indices: set[int], *, is_accepted: bool
+        self, status_before: CameraStatus | None, status: CameraStatus, old_indices: set[int], *, is_accepted: bool
     ) -> Capture | None:
         """Request the capture of the ordered picture, if the status shows that the picture was taken."""
-        if before is not None:
-            was_taken = status.image_count > before.image_count
-            new_index = before.image_count  # Indices begin at 0.
+        if status_before is not None:
+            was_taken = status.image_count > status_before.image_count
+            new_index = status_before.image_count  # Indices begin at 0.
             return await self.log.fetch(new_index) if was_taken else None
         # Without a status from before the order, the newest picture counts as the ordered one if the camera accepted
         # the order.
         newest = status.image_count - 1
-        if is_accepted and not status.is_capturing and newest >= 0 and newest not in old_indices:
+        has_new_picture = newest >= 0 and newest not in old_indices
+        if is_accepted and not status.is_capturing and has_new_picture:
             return await self.log.fetch(newest)
         return None
 
@@ -139,11 +140,13 @@ class Shutter:
             raise OperationRejected(f"{self.link.describe()} could not take the picture")
         return capture
 
-    async def order_photo(self, before: CameraStatus | None, *, is_repeated: bool = False) -> CommandTimeout | None:
+    async def order_photo(
+        self, status_before: CameraStatus | None, *, is_repeated: bool = False
+    ) -> CommandTimeout | None:
         """Send the order once. Returns the time-out if it was not acknowledged."""
         # A repeated order keeps its sequence number, so that a camera does not execute it twice.
         if not is_repeated:
-            pictures = 0 if before is None else before.image_count
+            pictures = 0 if status_before is None else status_before.image_count
             # An earlier program may have ordered the existing pictures with sequence numbers up to the image count, so
             # the new sequence number must be above it.
             self._sequence_number = max(pictures + 1, self._sequence_number + 1)
@@ -174,7 +177,7 @@ class Shutter:
         unchanged, take_photo = (0, 0, 0, 0), 1  # session, zoom and focus in param1 to param4, the shutter in param5
         await self.link.command(MavCmd.DO_DIGICAM_CONTROL, *unchanged, take_photo, attempts=1)
 
-    async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
+    async def start_series(self, order: Order, seconds: float, count: int, status_before: CameraStatus | None) -> None:
         if self.link.is_trigger:
             interval_ms, shutter_time, enable, sequence = seconds * 1000.0, UNCHANGED, 1, UNCHANGED
             await self.link.command(TRIGGER_INTERVAL, interval_ms, shutter_time)
@@ -183,9 +186,10 @@ class Shutter:
 
         async def has_started() -> bool | None:
             status = await self.request_status_reliably()
-            if status is None or before is None:
+            if status is None or status_before is None:
                 return None  # Without both reports, the number of pictures cannot be compared.
-            return status.is_in_series or status.is_capturing or status.image_count > before.image_count
+            has_new_picture = status.image_count > status_before.image_count
+            return status.is_in_series or status.is_capturing or has_new_picture
 
         params = (self.link.device_id, seconds, count)
         await self.link.order_once(
@@ -197,16 +201,17 @@ class Shutter:
         return (TRIGGER, 0, UNCHANGED) if self.link.is_trigger else (STOP, self.link.device_id)
 
 
-def _is_new(capture: Capture, before: CameraStatus | None, old_indices: set[int]) -> bool:
-    """Return True if the picture may have been ordered after the status ``before``."""
+def _is_new(capture: Capture, status_before: CameraStatus | None, old_indices: set[int]) -> bool:
+    """Return True if the picture may have been ordered after ``status_before`` was reported."""
     # A low index usually means an older picture. If no older capture has this index, the picture may be new, because a
     # camera may use the index of a failed picture again.
-    is_low = before is not None and capture.index < before.image_count
+    is_low = status_before is not None and capture.index < status_before.image_count
     return not is_low or capture.index not in old_indices
 
 
-def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
-    return before is not None and status.image_count <= before.image_count and not status.is_capturing
+def _has_taken_none(status_before: CameraStatus | None, status: CameraStatus) -> bool:
+    is_count_unchanged = status_before is not None and status.image_count <= status_before.image_count
+    return is_count_unchanged and not status.is_capturing
 
 
 class PhotoInterval:
@@ -218,7 +223,7 @@ class PhotoInterval:
 
     def __init__(self, shutter: Shutter, seconds: float, count: int) -> None:
         self._shutter = shutter
-        self._seconds = seconds  # interval between two pictures
+        self._interval_s = seconds
         self._count = count  # number of ordered pictures; 0 for a series without an end
         self._link = shutter.link
         self._log = shutter.log
@@ -261,13 +266,13 @@ class PhotoInterval:
         return self
 
     async def _begin(self, operation: ActiveOperation) -> None:
-        before = await self._shutter.request_status_reliably()
-        self._next_index = None if before is None else before.image_count
-        first_index = 0 if before is None else before.image_count
+        status_before = await self._shutter.request_status_reliably()
+        self._next_index = None if status_before is None else status_before.image_count
+        first_index = 0 if status_before is None else status_before.image_count
         self._set_newest(first_index - 1)
         self._known_reset_at = self._log.reset_at
         self._new_captures.__enter__()
-        await self._shutter.start_series(operation.order, self._seconds, self._count, before)
+        await self._shutter.start_series(operation.order, self._interval_s, self._count, status_before)
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         self._new_captures.__exit__()
@@ -305,7 +310,7 @@ class PhotoInterval:
             if self._received and self._next_index is not None:  # Later captures have arrived, but not the next one.
                 await self._fetch_next()
                 continue
-            patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # A picture may be late.
+            patience_s = max(2.0 * self._interval_s, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # A picture may be late.
             has_arrived = await self._new_captures.wait(patience_s)
             if has_arrived:
                 silent_checks = 0
@@ -326,9 +331,9 @@ class PhotoInterval:
 
     def _process_new_captures(self) -> None:
         while capture := self._new_captures.pop():
-            first = self._first_after_reset(capture)
-            if first is not None:
-                self._continue_after_reset(first)
+            first_capture = self._first_after_reset(capture)
+            if first_capture is not None:
+                self._continue_after_reset(first_capture)
             # If the camera has not reported its image count, the first capture counts as the start of the series. If a
             # later capture has a much lower index, the first one was corrupt, and the later one is the start.
             if self._next_index is None or self._contradicts_guess(capture.index):
@@ -336,13 +341,13 @@ class PhotoInterval:
             if self._is_plausible(capture.index):
                 self._add(capture)
 
-    def _continue_after_reset(self, first: Capture) -> None:
-        """Continue the series with the new indices, of which ``first`` has the lowest."""
+    def _continue_after_reset(self, first_capture: Capture) -> None:
+        """Continue the series with the new indices, of which ``first_capture`` has the lowest."""
         self._known_reset_at = self._log.reset_at
-        self._next_index = first.index
+        self._next_index = first_capture.index
         self._is_start_guessed = False
-        self._set_newest(first.index)
-        self._received = {first.index: first}
+        self._set_newest(first_capture.index)
+        self._received = {first_capture.index: first_capture}
 
     def _guess_start(self, index: int) -> None:
         self._is_start_guessed = self._next_index is None  # True in the first call; a second call corrects the guess.
@@ -366,7 +371,7 @@ class PhotoInterval:
         self._newest_at = self._link.now()
 
     def _max_new_captures(self) -> float:
-        return 2.0 * (self._link.now() - self._newest_at) / self._seconds + MAX_EXTRA_CAPTURES
+        return 2.0 * (self._link.now() - self._newest_at) / self._interval_s + MAX_EXTRA_CAPTURES
 
     def _is_plausible(self, index: int) -> bool:
         return index <= self._newest_index + self._max_new_captures()
@@ -413,9 +418,10 @@ class PhotoInterval:
         self._process_new_captures()
         is_ahead = status is not None and self._next_index is not None and status.image_count > self._next_index
         is_over = status is not None and not status.is_in_series and not status.is_capturing
+        has_undelivered = bool(self._received or self._failed)
         if status is not None and is_ahead and self._is_plausible(status.image_count - 1):
             await self._fetch_next()
-        elif is_over and not self._received and not self._failed:
+        elif is_over and not has_undelivered:
             raise OperationRejected(
                 f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
             )

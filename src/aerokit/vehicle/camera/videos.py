@@ -161,12 +161,12 @@ class VideoMixin(CameraMixin):
         """
         await self._link.require_capability("load_streams", "has_video_stream")
         self._streams.clear()  # Streams that were reported earlier may have changed.
-        first = await self._link.request(m.VideoStreamInformation, 0)  # 0 requests all streams.
-        if first is None:  # Some cameras answer only requests for a single stream.
-            first = await self._link.request(m.VideoStreamInformation, 1)
-        if first is None or not self._streams:
+        answer = await self._link.request(m.VideoStreamInformation, 0)  # 0 requests all streams.
+        if answer is None:  # Some cameras answer only requests for a single stream.
+            answer = await self._link.request(m.VideoStreamInformation, 1)
+        if answer is None or not self._streams:
             raise self._link.timeout_error("reported no video stream")
-        for number in range(1, first.count + 1):
+        for number in range(1, answer.count + 1):
             is_reported = number in self._streams or await self._request_stream(number)
             if not is_reported:
                 raise self._link.timeout_error(f"did not report its video stream {number}")

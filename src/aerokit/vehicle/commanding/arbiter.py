@@ -350,9 +350,9 @@ class CommandArbiter:
     def supersede_arm_commands(self, armed: bool) -> None:
         """Count a new order to arm or disarm. It ends earlier ones, which are then not sent again."""
         self.arm_commands_sent += 1
-        self.disarm_commands_sent += not armed
         self.last_arm_command = armed
         if not armed:
+            self.disarm_commands_sent += 1
             self.last_disarm_command_at = self._now()
         self.supersede(("arm",))
         for sent in self._sent_commands:
@@ -500,17 +500,13 @@ class CommandArbiter:
     def late_modes(self) -> tuple[Mode, ...]:
         """Return the modes of ended orders and missions that HEARTBEAT may still report."""
         since = self._now() - MODE_GRACE_S
-        return tuple(mode for at, mode in self._unreported_modes if at > since)
+        return tuple(mode for added_at, mode in self._unreported_modes if added_at > since)
 
     def _is_executing_newest(self) -> bool:
         order, mode = self.newest, self._telemetry.mode.latest
-        return (
-            order is not None
-            and mode is not None
-            and order.may_cause(mode)
-            and not order.takeover_reason
-            and not order.failsafe
-        )
+        if order is None or mode is None or not order.may_cause(mode):
+            return False
+        return not order.takeover_reason and not order.failsafe
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
         receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent_commands)

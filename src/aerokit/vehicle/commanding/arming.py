@@ -307,6 +307,10 @@ class ArmingActions(VehicleBase):
     ) -> None:
         cell, reported_after = self.telemetry.armed, max(started, reported_after)
 
+        def is_done() -> bool:
+            is_reported = cell.latest is armed and cell.updated_at > reported_after
+            return is_reported and self._arbiter.is_state_recent
+
         def failure_reason() -> str:
             if self._arbiter.last_arm_command is not armed:
                 return SUPERSEDED
@@ -316,7 +320,7 @@ class ArmingActions(VehicleBase):
         await await_progress(
             self._session,
             "arm()" if armed else "disarm()",
-            is_done=lambda: cell.latest is armed and cell.updated_at > reported_after and self._arbiter.is_state_recent,
+            is_done=is_done,
             failure_reason=failure_reason,
             describe=lambda: "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text",
             timeout=timeout,
@@ -342,7 +346,8 @@ class ArmingActions(VehicleBase):
 
         def is_done() -> bool:
             reported_at = armed.updated_at if self._arbiter.is_state_recent else -math.inf
-            return reported_at > is_certain_at or (reported_at > started and not armed.latest)
+            has_just_disarmed = reported_at > started and not armed.latest
+            return reported_at > is_certain_at or has_just_disarmed
 
         def failure_reason() -> str:
             if self._arbiter.last_arm_command is not True:
@@ -466,7 +471,8 @@ class ArmingActions(VehicleBase):
         )
 
     async def _order_reboot(self, order: Order, force: bool) -> None:
-        params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
+        reboot_autopilot, unused = 1, (0.0,) * 4
+        params = (reboot_autopilot, *unused, FORCE_REBOOT if force else 0)
         # If only the acknowledgement is lost, a repetition would cause another reboot.
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ACK_TIMEOUT_S}
         await self._sender.send_long(order, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)

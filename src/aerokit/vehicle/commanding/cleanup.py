@@ -107,7 +107,8 @@ MAX_HOLD_ATTEMPTS = 3
 # slow link, it is repeated later and less often.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
-# NaN means the present position, so the vehicle brakes and does not fly back to a point that it has passed.
+# -1 and 0 leave the speed and the radius of a circle to the vehicle. NaN means the present position, so the vehicle
+# brakes and does not fly back to a point that it has passed.
 STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(math.nan,) * 4)
 
 
@@ -187,7 +188,7 @@ class FlightCleanup:
             return False
         # If `only_stops` is True, `stop_in` has probably sent the hold already. It is then repeated after a HEARTBEAT.
         can_send_now = self._arbiter.is_state_recent and not order.only_stops
-        # Each change of the mode has the same MAV_CMD, so the next COMMAND_ACK may answer the one of `order`.
+        # Each change of the mode has the same MAV_CMD, so the next COMMAND_ACK may answer the command of `order`.
         is_ack_ambiguous = not self._holds_by_reposition and session.connection.now() < order.given_at + MODE_GRACE_S
         if can_send_now:
             command, *params = self._hold_command(mode)
@@ -417,12 +418,9 @@ class ArmCleanup:
         """Return True if the vehicle was armed in a mode that starts a flight, and no newer order steers it."""
         telemetry, newest = self._session.telemetry, self._arbiter.latest(STEERING)
         was_steered = newest is not None and newest.number > order.number
-        return (
-            telemetry.mode_name in self._session.autopilot.modes_starting_flight
-            and telemetry.is_armed
-            and not was_steered
-            and self._arbiter.is_state_recent
-        )
+        is_in_flight_mode = telemetry.mode_name in self._session.autopilot.modes_starting_flight
+        is_flying = is_in_flight_mode and telemetry.is_armed
+        return is_flying and not was_steered and self._arbiter.is_state_recent
 
     async def _hold_after_arming(self) -> None:
         mode = self._session.telemetry.mode_name

@@ -198,7 +198,7 @@ class LobeCounter:
         # A vehicle is in a lobe if it is farther than this from the center along the axis.
         self._min_along_m = major_m / 2
         self._axis = math.radians(axis_deg)
-        self._lobe = 0  # Number of the lobe in which the vehicle was last, 1 or -1; 0 if it was in none yet
+        self._lobe = 0  # number of the lobe in which the vehicle was last, 1 or -1; 0 if it was in none yet
         self.rounds: float = 0.0
         self.is_on_path: bool = False
         """True while the vehicle is in one of the lobes, far enough from the crossing to tell them apart."""

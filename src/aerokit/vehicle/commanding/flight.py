@@ -178,7 +178,8 @@ class FlightActions(VehicleBase):
             here_amsl_m = self._position.altitude_amsl()
             missing_above_home_m = altitude_m - self._position.altitude_relative()
             target_m = here_amsl_m + missing_above_home_m
-            if target_amsl_m is None and self._position.was_received_since(started) and math.isfinite(target_m):
+            is_target_known = self._position.was_received_since(started) and math.isfinite(target_m)
+            if target_amsl_m is None and is_target_known:
                 target_amsl_m = target_m
             return missing_above_home_m if target_amsl_m is None else target_amsl_m - here_amsl_m
 
@@ -254,7 +255,8 @@ class FlightActions(VehicleBase):
             # After a landing, PX4 disarms and changes to LOITER, which ends the order. The vehicle is then on the
             # ground, as ordered. If the vehicle has refused the mode, the order has not ended, and the error is raised.
             is_down = self.telemetry.is_confirmed_disarmed or is_reported_on_ground(self.telemetry)
-            if not (order.end and is_down and order.is_newest):
+            has_ended_by_landing = order.end and is_down and order.is_newest
+            if not has_ended_by_landing:
                 raise
 
     async def _await_ground(
@@ -284,7 +286,8 @@ class FlightActions(VehicleBase):
             return ground.confirms(is_disarmed or is_landed or has_surfaced)
 
         def failure_reason() -> str | None:
-            if has_left_surfacing_mode() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
+            has_stopped_surfacing = has_left_surfacing_mode() and is_deep()
+            if has_stopped_surfacing and self.connection.now() > accepted_at + MODE_GRACE_S:
                 return f"the mode changed to {self.telemetry.mode_name} at {self._position.altitude_relative():.1f} m"
             return ground.failure_reason(landing_failure)
 

@@ -86,8 +86,10 @@ class FollowedTarget:
     def read(self) -> TargetState | None:
         if isinstance(self._target, HasTelemetry):
             self._read_vehicle(self._target.telemetry)
-        elif not isinstance(self._target, AsyncIterable) and (position := self._target()) is not None:
-            self.add(position)
+        elif not isinstance(self._target, AsyncIterable):
+            position = self._target()
+            if position is not None:
+                self.add(position)
         return self.latest
 
     def _read_vehicle(self, telemetry: Any) -> None:
@@ -208,8 +210,8 @@ class FollowStream(SteeringStream[TargetState]):
         Raises:
             SetpointStreamStopped: the stream has stopped; the error text has the reason.
         """
-        until = math.inf if duration_s is None else self._now() + duration_s
-        while (remaining_s := until - self._now()) > 0:
+        ends_at = math.inf if duration_s is None else self._now() + duration_s
+        while (remaining_s := ends_at - self._now()) > 0:
             self._raise_if_stopped()
             await anyio.sleep(min(remaining_s, POLL_INTERVAL_S))
         self._raise_if_stopped()
@@ -273,13 +275,13 @@ class FollowStream(SteeringStream[TargetState]):
             scope.cancel()
 
     async def _first_state(self) -> TargetState:
-        until = self._now() + self._valid_for_s
+        deadline = self._now() + self._valid_for_s
         while True:
             self._session.end.raise_if_ended()
             state = self._tracker.read()
             if state is not None and self._now() - state.reported_at <= self._valid_for_s:
                 return state
-            if self._now() > until or self._end_reason:
+            if self._now() > deadline or self._end_reason:
                 reason = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
                 raise OperationTimeout(f"follow: {reason}; the stream was not started")
             await anyio.sleep(POLL_INTERVAL_S)
@@ -327,8 +329,9 @@ class FollowStream(SteeringStream[TargetState]):
     def _stop_reason(self, lag: float) -> str | None:
         if self._end_reason:
             return self._end_reason
-        if math.inf > self.distance_m > self._max_distance_m:
-            return f"the target is {self.distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
+        distance_m = self.distance_m  # infinite while it is unknown
+        if self._max_distance_m < distance_m < math.inf:
+            return f"the target is {distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
         return super()._stop_reason(lag)
 
     def _zero_bearing_deg(self, state: TargetState) -> float:

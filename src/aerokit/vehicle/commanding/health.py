@@ -33,9 +33,9 @@ RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 def ordered_reasons(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
     """Join the reasons about missing or old reports with the others. Reports that decide about arming come first."""
-    first = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
-    last = [reason for reason in report_reasons if reason not in first]
-    return [*first, *other_reasons, *last]
+    about_arming = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
+    other_reports = [reason for reason in report_reasons if reason not in about_arming]
+    return [*about_arming, *other_reasons, *other_reports]
 
 
 class Health:
@@ -60,8 +60,10 @@ class Health:
             if not cell.is_known
         ]
         texts = self._recent_arming_reasons()
-        is_explained = texts or self._failing_sensors() or (self._mode_needs_position() and self._missing_estimates())
-        unexplained = self._unexplained_failures() if self._prearm_checks_fail() and not is_explained else []
+        preventing_estimates = self._missing_estimates() if self._mode_needs_position() else []
+        is_explained = bool(texts or self._failing_sensors() or preventing_estimates)
+        is_unexplained = self._prearm_checks_fail() and not is_explained
+        unexplained = self._unexplained_failures() if is_unexplained else []
         other_reasons = [*texts, *self._health_problems(), *unexplained]
         return ordered_reasons([*missing, *self._outdated_states()], other_reasons)
 
@@ -79,8 +81,8 @@ class Health:
         ]
         if self._autopilot.runs_prearm_checks and timed_reasons:
             # ArduPilot reports all failing checks together, so older texts may be about checks that pass now.
-            last_report_at = max(at for at, _ in timed_reasons) - PREARM_REPORT_DURATION_S
-            timed_reasons = [(at, reason) for at, reason in timed_reasons if at >= last_report_at]
+            report_began_at = max(received_at for received_at, _ in timed_reasons) - PREARM_REPORT_DURATION_S
+            timed_reasons = [(at, reason) for at, reason in timed_reasons if at >= report_began_at]
         return list(dict.fromkeys(reason for _, reason in timed_reasons))  # without duplicates
 
     def _outdated_states(self) -> list[str]:

@@ -227,7 +227,8 @@ class Order:
             return SUPERSEDED
         if self.is_closed and not self.takeover_reason:
             return "its `with` block was left"
-        return self.takeover_reason or ("" if self.ends_flight else self.failsafe)
+        ending_failsafe = "" if self.ends_flight else self.failsafe
+        return self.takeover_reason or ending_failsafe
 
     @property
     def is_effect_due(self) -> bool:
@@ -260,7 +261,8 @@ class Order:
         is_settled = reported_at >= self.settles_at  # The modes of all earlier orders must have been reported by now.
         is_of_earlier_order = number in self._expected_modes and number in self._accepted_modes
         is_of_this_order = number in self._own_modes
-        if is_change and (is_of_earlier_order or (is_of_this_order and self.was_sent)):
+        is_own_effect = is_of_this_order and self.was_sent
+        if is_change and (is_of_earlier_order or is_own_effect):
             self.may_move = True
         if is_of_this_order:
             self._on_own_mode(is_change=is_change, is_settled=is_settled)
@@ -354,7 +356,8 @@ class SentCommand:
             return "its effect was reported"
         if self._slept_s() > 0:  # The computer has slept since the command was sent, perhaps for hours.
             return "the computer slept"
-        return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
+        overruled = SUPERSEDED if self._is_overruled else ""
+        return self.order.end or overruled or self.order.unexplained
 
     def on_newer_arm_command(self, armed: bool) -> None:
         if self.arms is not None and armed is not self.arms:

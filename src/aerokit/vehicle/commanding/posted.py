@@ -55,7 +55,9 @@ class PostedOrder:
     @property
     def end(self) -> str:
         """Text that explains why the order's commands are not repeated; empty while they may be repeated."""
-        return "its effect was reported" if self._order.is_confirmed else self._order.end or self._order.unexplained
+        if self._order.is_confirmed:
+            return "its effect was reported"
+        return self._order.end or self._order.unexplained
 
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG of this order. Returns at the acknowledgement, or when the order's effect is reported.
@@ -124,7 +126,8 @@ class PostedOrder:
                 await self._sender.request_mode(mode, self._order, base_mode=mode.base_mode, component_id=component_id)
                 await self.wait_confirmed(timeout)
             except CommandRejected as error:
-                may_retry = error.result == MavResult.TEMPORARILY_REJECTED and attempts_left and not self.end
+                is_temporary = error.result == MavResult.TEMPORARILY_REJECTED
+                may_retry = is_temporary and attempts_left > 0 and not self.end
                 if may_retry and await self._is_valid_at_next_heartbeat(timeout):
                     continue
                 # Ignore the refusal if HEARTBEAT reports this mode. `is_confirmed` alone may be due to another mode of

@@ -96,7 +96,8 @@ async def await_progress(
                 raise OperationTimeout(
                     f"{operation}: not done within {timeout:g} s; {describe()}; {session.describe_link()}"
                 )
-            if stall_reason is not None and (stall := stall_reason()):
+            stall = None if stall_reason is None else stall_reason()
+            if stall:
                 raise OperationTimeout(f"{operation}: {stall}; {describe()}; {session.describe_link()}")
             await changes.next(POLL_INTERVAL_S)
 
@@ -190,9 +191,11 @@ class StallDetector:
 
     def _describe_descent(self, here: Position) -> str:
         altitude_m = here.altitude_amsl_m
-        if altitude_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._max_altitude_m - altitude_m <= 1.0:
+        if altitude_m is None or self._max_sink_m_s < FALL_SINK_M_S:
             return ""
-        return f", after it descended {self._max_altitude_m - altitude_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
+        descended_m = self._max_altitude_m - altitude_m
+        text = f", after it descended {descended_m:.1f} m at up to {self._max_sink_m_s:.1f} m/s"
+        return text if descended_m > 1.0 else ""
 
 
 def is_on_wings(session: VehicleSession) -> bool:
@@ -422,7 +425,8 @@ class VehiclePosition:
         home_m = None if home.latest is None else home.latest.altitude_amsl_m
         if position.latest is not None and position.updated_at > home.updated_at:  # `home` may be outdated.
             amsl_m, relative_m = position.latest.altitude_amsl_m, position.latest.altitude_relative_m
-            home_m = home_m if amsl_m is None or relative_m is None else amsl_m - relative_m
+            if amsl_m is not None and relative_m is not None:
+                home_m = amsl_m - relative_m
         if target.altitude_relative_m is None or home_m is None:
             return target
         return target.replace(altitude_relative_m=None, altitude_amsl_m=home_m + target.altitude_relative_m)

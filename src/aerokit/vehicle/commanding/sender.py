@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 FORCE = 21196
 """param2 of COMPONENT_ARM_DISARM that skips the pre-arm checks."""
-# HEARTBEAT reports the effect of a command to disarm within this many seconds, even if one of them is lost.
+# HEARTBEAT reports the effect of a command to disarm within this many seconds, even if one HEARTBEAT is lost.
 DISARM_REPORT_TIMEOUT_S = 3.5
 ACCEPTANCE_REVOKED = "the vehicle accepted the command and then refused it"
 
@@ -218,7 +218,8 @@ class OrderSender:
             )
         is_current = self._arbiter.is_state_recent and not self._arbiter.slept_since(started)
         is_last_command_to_disarm = self._arbiter.last_arm_command is False
-        if is_still_armed and is_current and is_last_command_to_disarm and not order.end:
+        may_repeat = is_current and is_last_command_to_disarm and not order.end
+        if is_still_armed and may_repeat:
             await self.send_arm(order, armed=False, force=force)
             accepted_at = now()
         return AcceptedDisarm(accepted_at, effect_reported_after())
@@ -271,7 +272,8 @@ class OrderSender:
         """Order a mode without waiting for HEARTBEAT to report it."""
         request = self._session.autopilot.mode_order(mode)
         if base_mode is not None:
-            request = request.replace(base_mode=base_mode, params=(base_mode, *request.params[1:]))
+            _, *mode_numbers = request.params
+            request = request.replace(base_mode=base_mode, params=(base_mode, *mode_numbers))
         try:
             await self.send_long(
                 order,
@@ -357,7 +359,8 @@ class OrderSender:
             if not refusals:
                 raise
             order.was_refused = True
-            error = revoked_acceptance(operation, refusals[-1].command, refusals[-1].result)
+            last_refusal = refusals[-1]
+            error = revoked_acceptance(operation, last_refusal.command, last_refusal.result)
             raise self._session.with_reasons(error, started) from None
 
     async def ensure_mode(self, mode: Mode, order: Order) -> None:

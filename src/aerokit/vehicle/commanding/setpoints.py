@@ -174,10 +174,13 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
         return max_resting_m < distance_m < math.inf
     # Reading `local_position` decodes a message, so it is read only for the set-points that need it: this function is
     # called up to 400 times a second.
-    if isinstance(setpoint, LocalPositionSetpoint) and (here := context.session.telemetry.local_position.latest):
-        north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
-        return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > max_resting_m
-    return False
+    if not isinstance(setpoint, LocalPositionSetpoint):
+        return False
+    here = context.session.telemetry.local_position.latest
+    if here is None:
+        return False
+    north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
+    return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > max_resting_m
 
 
 class SetpointEncoder:
@@ -267,7 +270,7 @@ class SetpointEncoder:
         return SetActuatorControlTarget(self._time_ms() * 1000, setpoint.group, *self._address, setpoint.controls)
 
     def _time_ms(self) -> int:
-        return int(self._session.connection.now() * 1000) & 0xFFFFFFFF
+        return int(self._session.connection.now() * 1000) & 0xFFFFFFFF  # The field has 32 bits.
 
 
 def _encode_yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:

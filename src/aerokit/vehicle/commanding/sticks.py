@@ -129,7 +129,8 @@ class StickStream(SteeringStream[StickInput]):
             await self._check_ardupilot_parameters()
 
     async def _check_px4_parameters(self) -> None:
-        source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
+        values = await known_values(self._probe, "COM_RC_IN_MODE")
+        source = values.get("COM_RC_IN_MODE")
         if source in (RC_ONLY, DISABLED):
             raise OperationRejected(
                 f"sticks: COM_RC_IN_MODE = {source:g} makes PX4 ignore MANUAL_CONTROL; set COM_RC_IN_MODE to 1"

@@ -105,8 +105,8 @@ class ValueStream(Generic[ValueT]):
 
     async def _supply_for(self, value: ValueT, duration_s: float) -> None:
         """Supply the value for ``duration_s`` seconds, so that it does not expire in this time."""
-        until = self._now() + duration_s
-        while (remaining_s := until - self._now()) > 0:
+        ends_at = self._now() + duration_s
+        while (remaining_s := ends_at - self._now()) > 0:
             self._set(value)
             await anyio.sleep(min(remaining_s, self._valid_for_s / 3))
         self._raise_if_stopped()
@@ -273,8 +273,9 @@ class SteeringStream(ValueStream[ValueT]):
 
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         """Order a hold. If the stream has already stopped, raise its error instead, unless it was raised before."""
-        if self._stop_error is None and (reason := self._takeover_reason()):
-            self._stop(reason, hold=False)
+        takeover_reason = self._takeover_reason() if self._stop_error is None else None
+        if takeover_reason is not None:
+            self._stop(takeover_reason, hold=False)  # This sets `_stop_error`.
         if self._stop_error is None:
             try:
                 await self._leave(exc)
@@ -321,7 +322,7 @@ class SteeringStream(ValueStream[ValueT]):
 
     def _takeover_reason(self) -> str | None:
         if self._order is not None and not self._order.is_newest:
-            return SUPERSEDED  # This is checked before the mode, because the newer order may have changed the mode.
+            return SUPERSEDED  # The order is checked before the mode, because a newer order may have changed the mode.
         mode = self._session.telemetry.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
@@ -368,15 +369,16 @@ class TakeoverCheck:
         """Raise OperationRejected if an order was given, or if the mode was changed."""
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} meanwhile; this order was not sent")
-        before, mode = self._mode_before, self._telemetry.mode.latest
-        is_unchanged = before is None or mode == before
+        mode_before, mode = self._mode_before, self._telemetry.mode.latest
+        is_unchanged = mode_before is None or mode == mode_before
         # The end of a take-off, and a change to the mode that the caller wants to order, are not takeovers.
-        is_end_of_take_off = (before, mode) == self._end_of_take_off
+        is_end_of_take_off = (mode_before, mode) == self._end_of_take_off
         order = self._order_before
-        is_late_effect = self._may_change_late and order is not None and mode is not None and order.may_cause(mode)
+        is_mode_of_order = order is not None and mode is not None and order.may_cause(mode)
+        is_late_effect = self._may_change_late and is_mode_of_order
         if is_unchanged or mode == self._next_mode or is_end_of_take_off or is_late_effect:
             return
-        raise OperationRejected(f"{operation}: the mode changed from {before} to {mode}; the order was not sent")
+        raise OperationRejected(f"{operation}: the mode changed from {mode_before} to {mode}; the order was not sent")
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:

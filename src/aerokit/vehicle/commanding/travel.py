@@ -223,7 +223,8 @@ class TravelActions(VehicleBase):
             if unacknowledged_target is None or now - sent_at < RESEND_INTERVAL_S:
                 return
             # Once the computer has slept, the target is never sent again, because it would be too late.
-            if self._arbiter.is_state_recent and not order.end and not self._arbiter.slept_since(sent_at):
+            has_computer_slept = self._arbiter.slept_since(sent_at) > 0
+            if self._arbiter.is_state_recent and not order.end and not has_computer_slept:
                 sent_at = now
                 self.connection.send(unacknowledged_target)
 
@@ -434,7 +435,8 @@ class TravelActions(VehicleBase):
         return self._position.distance_to(position_with_altitude(target))
 
     def _check_can_turn(self, heading_deg: float | None) -> None:
-        if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
+        can_turn = self._turns_by_reposition or self.autopilot.condition_yaw
+        if heading_deg is not None and not can_turn:
             raise NotSupported(f"{self.autopilot.firmware} has no command to turn to a heading; nothing was sent")
 
     @property
@@ -483,7 +485,9 @@ class LookActions(VehicleBase):
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         place = self._position.command_int_place(position_with_altitude(target))
-        if not self._session.commands.is_unsupported(ROI_LOCATION) and await self._set_roi_location(place):
+        is_unsupported = self._session.commands.is_unsupported(ROI_LOCATION)
+        was_set = not is_unsupported and await self._set_roi_location(place)
+        if was_set:
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
         above_home_m = place["z"] if is_relative else place["z"] - self._position.home_altitude()

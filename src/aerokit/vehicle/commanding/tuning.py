@@ -90,8 +90,8 @@ class TuningActions(VehicleBase):
         self._session.end.raise_if_ended()
         answers.clear()
         self._session.commands.send_unconfirmed(MavCmd.DO_AUTOTUNE_ENABLE, 1)
-        until = self.connection.now() + ANSWER_TIMEOUT_S
-        while self.connection.now() < until:
+        deadline = self.connection.now() + ANSWER_TIMEOUT_S
+        while self.connection.now() < deadline:
             for answer in answers:
                 if self._session.is_answer(answer, MavCmd.DO_AUTOTUNE_ENABLE):
                     return answer

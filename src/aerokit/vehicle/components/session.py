@@ -114,10 +114,11 @@ async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, i
     """Return the content of a file. Raises the errors of `Component.fetch`."""
     match = _MAVFTP.fullmatch(uri)
     if match is not None:
-        owner = int(match[1]) if match[1] else component_id  # id of the component that stores the file
+        id_text, path = match.groups()
+        owner = int(id_text) if id_text else component_id  # id of the component that stores the file
         if not 1 <= owner <= 255:
             raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: its component id must be 1 to 255")
-        return await _read_limited(files_of(owner), unquote(match[2]), idle_timeout_s)
+        return await _read_limited(files_of(owner), unquote(path), idle_timeout_s)
     if uri.lower().startswith(WEB_SCHEMES):
         return await _WebDownload(uri, idle_timeout_s).content()
     raise InvalidArgument(f"uri = {short_repr(uri)} is not allowed: it must begin with mftp://, http:// or https://")
@@ -210,7 +211,10 @@ class _WebDownload:
                 raise OSError("no response")
             with answer:
                 content = bytearray()
-                while not self._is_aborted and (block := answer.read1(BLOCK_SIZE)):
+                while not self._is_aborted:
+                    block = answer.read1(BLOCK_SIZE)
+                    if not block:
+                        break
                     content += block
                     if len(content) > MAX_FILE_SIZE:
                         raise file_too_large(self._uri)

@@ -258,11 +258,12 @@ class Settings:
                 return self._with_definition(confirmed)
 
     async def _write_undefined(self, name: str, value: object, idle_timeout_s: float) -> Setting:
-        known = self._known.get(name)
-        if known is None or name in self._in_doubt:
-            known = _setting_or_raise((await self._read([name], idle_timeout_s))[name])
-        raw_value = checked_setting(name, value, known.type)
-        return await self._write(name, raw_value, known.type, known.value, idle_timeout_s)
+        present = self._known.get(name)
+        if present is None or name in self._in_doubt:
+            answers = await self._read([name], idle_timeout_s)
+            present = _setting_or_raise(answers[name])
+        raw_value = checked_setting(name, value, present.type)
+        return await self._write(name, raw_value, present.type, present.value, idle_timeout_s)
 
     async def _write_defined(
         self, setting_definition: SettingDefinition, value: object, idle_timeout_s: float
@@ -274,9 +275,9 @@ class Settings:
         await self._read_before_write(definition, setting_definition, idle_timeout_s)
         # Check the value again, because the values that were just read may exclude or restrict this setting.
         checked_value = definition.checked(name, value, self._values())
-        known = self._known.get(name)
-        wire_type = setting_definition.wire_type if known is None else known.type
-        old_value = None if known is None else known.value
+        present = self._known.get(name)
+        wire_type = setting_definition.wire_type if present is None else present.type
+        old_value = None if present is None else present.value
         raw_value = checked_setting(name, checked_value, wire_type)
         return await self._write(name, raw_value, wire_type, old_value, idle_timeout_s)
 
@@ -287,7 +288,8 @@ class Settings:
         name = setting_definition.name
         restricting_names = definition.dependencies(name)
         to_read = [other for other in restricting_names if self._must_be_read(definition.settings[other])]
-        if (name not in self._known or name in self._in_doubt) and not setting_definition.write_only:
+        is_unknown = name not in self._known or name in self._in_doubt
+        if is_unknown and not setting_definition.write_only:
             to_read.append(name)
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
         for answered_name, answer in answers.items():
@@ -330,7 +332,8 @@ class Settings:
         assert self._definition is not None
         settings = self._definition.settings
         readable = [name for name in names if name in settings and not settings[name].write_only]
-        for name, answer in (await self._read(readable, idle_timeout_s)).items():
+        answers = await self._read(readable, idle_timeout_s)
+        for name, answer in answers.items():
             if not isinstance(answer, Setting):
                 self._known.pop(name, None)
 

@@ -273,7 +273,8 @@ class Actuators(ReadOnly):
             # Send the stop command only while the test runs. Afterwards it would start another test, which arms the
             # motors.
             is_spinning = session.connection.now() < spins_until
-            if is_spinning and order.is_newest and arbiter.is_state_recent and session.connection.is_open:
+            can_send = arbiter.is_state_recent and session.connection.is_open
+            if is_spinning and order.is_newest and can_send:
                 session.commands.send_unconfirmed(command, *stop)
             raise
 

@@ -131,7 +131,8 @@ class Shell(ReadOnly):
         while True:  # Messages that are not for us do not extend the time.
             message = await self._output.get(None if timeout is None else max(0.0, deadline - now()))
             is_for_us = message.target_system in (0, self._session.connection.source_system)
-            if is_for_us and message.device == SerialControlDev.DEV_SHELL and message.flags & _REPLY:
+            is_shell_output = message.device == SerialControlDev.DEV_SHELL and message.flags & _REPLY
+            if is_for_us and is_shell_output:
                 return bytes(message.data[: message.count]).decode(errors="replace")
 
     async def run(self, command: str, *, timeout: float = 10.0) -> str:

@@ -179,8 +179,8 @@ class External:
 
     async def _await_origin(self, origin: Position, timeout: float) -> None:
         cell, connection = self._session.telemetry.origin, self._session.connection
-        until = connection.now() + timeout
-        while (remaining_s := until - connection.now()) > 0:
+        deadline = connection.now() + timeout
+        while (remaining_s := deadline - connection.now()) > 0:
             self._request_origin()
             wait_s = min(POLL_INTERVAL_S, remaining_s)
             with suppress(OperationTimeout):

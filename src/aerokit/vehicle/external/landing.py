@@ -197,7 +197,7 @@ class TargetLanding:
         except ValueUnknownError:
             # Without PX4's attitude or local position, the target cannot be converted. It counts as not visible.
             return
-        unseen_s = self._now() - self._seen_at
+        unseen_s = self._now() - self._seen_at  # infinite at the first measurement
         if LOST_AFTER_S < unseen_s < math.inf:
             self._losses.append(TargetLoss(unseen_s, self._seen_height_m))
         self._last = target

@@ -152,9 +152,11 @@ class MeasurementStream(Generic[MeasurementT]):
         rule = self._session.autopilot.external.kinds.get(self._kind)
         estimator = self._session.telemetry.estimator
         health = estimator.latest
-        if rule is None or not rule.sole_source or not self._parameters or health is None:
+        if rule is None or not rule.sole_source:  # These measurements supply no position.
             return "unknown"
-        if estimator.age > ESTIMATOR_MAX_AGE_S or not self._sent:
+        if health is None or estimator.age > ESTIMATOR_MAX_AGE_S:
+            return "unknown"
+        if not self._parameters or not self._sent:  # The stream was not entered, or has sent nothing.
             return "unknown"
         has_position = health.has_relative_position or health.has_absolute_position
         # PX4 also sets CONSTANT_POSITION while the vehicle stands still on the ground.

@@ -167,7 +167,8 @@ class FileChannel:
             try:
                 reply = await self.transfers.run(request)
             except FileError as error:
-                if not has_closed_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
+                may_be_own_session = request.attempts > 1 and error.code in SESSION_IN_USE
+                if may_be_own_session and not has_closed_own_session:
                     # If the reply to an earlier request was lost, this program may already have a session. Close it.
                     # PX4 has only one session: if it belongs to another station, that station must open its file again.
                     has_closed_own_session = True
@@ -186,7 +187,7 @@ class FileChannel:
                     self._close_soon(session, path)
                 raise
             else:
-                return RemoteFile(reply.session, int.from_bytes(reply.data[:4], "little"))
+                return RemoteFile(reply.session, size=int.from_bytes(reply.data[:4], "little"))
 
     def _session_request(
         self, opcode: MavFtpOpcode, path: str, session: int, idle_timeout_s: float, *, is_sent: bool = False

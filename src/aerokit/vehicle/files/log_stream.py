@@ -187,6 +187,8 @@ class LogStream(ReadOnly):
         while True:  # Messages that add nothing to the log do not extend the time-out.
             idle_since = max(started_at, self._assembler.received_at)
             message = await self._messages.get(max(0.0, idle_since + self._idle_timeout_s - connection.now()))
-            is_for_us = message.target_system in (0, connection.source_system)
-            if is_for_us and (data := self._assembler.add(message, connection.now())):
+            if message.target_system not in (0, connection.source_system):
+                continue  # PX4 streams to another station.
+            data = self._assembler.add(message, connection.now())
+            if data:
                 return data

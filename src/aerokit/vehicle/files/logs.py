@@ -267,8 +267,10 @@ class Logs:
         self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> _LocatedLog:
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
-        if not prefers_messages and (located := await self._locate_file(log, idle_timeout_s)) is not None:
-            return located
+        if not prefers_messages:
+            located = await self._locate_file(log, idle_timeout_s)
+            if located is not None:
+                return located
         try:
             # With "auto", another method may work, so give up early.
             max_unanswered = MAX_UNANSWERED_REQUESTS if method == "auto" else None
@@ -439,7 +441,7 @@ async def listed_logs(
 
 
 async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -> tuple[ListedLog, ...]:
-    root = directory.rpartition("/")[0]
+    root, _, _ = directory.rpartition("/")
     try:
         text = await files.read(f"{root}/{PX4_LIST}", idle_timeout_s=idle_timeout_s)
     except FileError:
@@ -450,7 +452,7 @@ async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -
         if match is not None:
             time_utc, size, path = match.groups()
             # `directory` is PX4's directory "log", seen from the root of MAVFTP.
-            path_below_directory = path.partition("/log/")[2]
+            _, _, path_below_directory = path.partition("/log/")
             logs.append(ListedLog(number, int(time_utc), int(size), f"{directory}/{path_below_directory}"))
     if len(logs) < len(matches):  # A file with other lines is not PX4's list.
         return ()

@@ -145,7 +145,8 @@ class ReleaseCommand:
             # While the computer slept or the vehicle was silent, another station may have begun to use the gimbal.
             has_computer_slept = arbiter.slept_since(command_sent_at) > 0
             is_vehicle_silent = not arbiter.is_state_recent
-            if has_computer_slept or is_vehicle_silent or not self._session.is_open or not self._is_still_due():
+            may_be_used_by_others = has_computer_slept or is_vehicle_silent
+            if may_be_used_by_others or not self._session.is_open or not self._is_still_due():
                 return
             self._session.connection.send(message)
             await asyncio.sleep(STOP_MESSAGE_INTERVAL_S)

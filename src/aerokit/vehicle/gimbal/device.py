@@ -271,8 +271,9 @@ class GimbalDevice:
 def _is_older(message: GimbalManagerStatus, newest: GimbalManagerStatus) -> bool:
     older_by_ms = newest.time_boot_ms - message.time_boot_ms
     frame, newest_frame = message.received_frame, newest.received_frame
-    if older_by_ms == 0 and message.time_boot_ms and frame is not None and newest_frame is not None:
-        # The manager sent both in the same millisecond. The sequence number of MAVLink frames returns to 0 after 255.
+    are_simultaneous = older_by_ms == 0 and message.time_boot_ms != 0  # sent in the same millisecond
+    if are_simultaneous and frame is not None and newest_frame is not None:
+        # The sequence number of MAVLink frames returns to 0 after 255.
         return 0 < (newest_frame.sequence - frame.sequence) % 256 < 128
     return 0 < older_by_ms < REORDER_WINDOW_MS
 

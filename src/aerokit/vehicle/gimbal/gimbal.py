@@ -174,8 +174,8 @@ class RoiMixin(GimbalMixin):
 INFORMATION_TIMEOUT_S = 2.0
 
 
-def _is_new(message: Message | None, before: Message | None) -> bool:
-    return message is not None and message is not before
+def _is_new(message: Message | None, old_message: Message | None) -> bool:
+    return message is not None and message is not old_message
 
 
 @checks_arguments

@@ -64,12 +64,12 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         _check_rates(*first_rates)
         self._orders = orders
         self._flags = int(LOCKED if is_from_north else LEVEL)
-        # Time at which the manager accepted the first rates. Its silence begins then, if it sends nothing.
+        # Time at which the manager accepted the first rates. If it sends nothing, it counts as silent since then.
         self._began_at = -math.inf
         self._order: Order | None = None
         # The error that describes the loss of control; None until control is lost.
         self._loss: AerokitError | None = None
-        # Marks the gimbal as in use until it is closed, so that ``vehicle.gimbal`` does not become another gimbal.
+        # Until this stack is closed, the gimbal counts as in use, so that ``vehicle.gimbal`` stays this gimbal.
         self._cleanup = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
@@ -119,8 +119,9 @@ class GimbalRates(ValueStream[tuple[float, float]]):
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Stop the gimbal. If the stream has already stopped, raise its error instead."""
-        if self._stop_error is None and (reason := self._takeover_reason()):
-            self._stop(reason, hold=False)  # This sets `_stop_error`.
+        takeover_reason = self._takeover_reason() if self._stop_error is None else None
+        if takeover_reason is not None:
+            self._stop(takeover_reason, hold=False)  # This sets `_stop_error`.
         if self._stop_error is None:
             # Create the command before `_end`, because afterwards it might address another gimbal.
             stop_command = self._zero_rates_command()
@@ -165,7 +166,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return SUPERSEDED if self._order is not None and not self._order.is_newest else None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        stop_command = self._zero_rates_command()  # After `super()._stop`, it might address another gimbal.
+        stop_command = self._zero_rates_command()  # After `super()._stop`, the command might address another gimbal.
         super()._stop(reason, hold=hold)
         if hold:
             stop_command.send_soon()

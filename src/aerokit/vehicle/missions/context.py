@@ -140,9 +140,11 @@ class PlanContext:
             return True
         # Another station may have replaced the plan over a link of its own.
         reported_id, count = self.plan_id(mission_type, cache.updated_at), self.tracker.count
-        has_other_id = 0 not in (reported_id, cache.plan_id) and reported_id != cache.plan_id
+        are_ids_known = reported_id != 0 and cache.plan_id != 0
+        has_other_id = are_ids_known and reported_id != cache.plan_id
         is_count_newer = mission_type == MavMissionType.MISSION and count.updated_at > cache.updated_at
-        if has_other_id or (is_count_newer and count.latest != len(items) - self.offset_of(mission_type)):
+        has_other_count = is_count_newer and count.latest != len(items) - self.offset_of(mission_type)
+        if has_other_id or has_other_count:
             return True
         from aerokit.missions.compare import ItemStorage, changed_items
 
@@ -215,7 +217,7 @@ class PlanContext:
         holds = self.autopilot.holds_after_mission and self.tracker.is_in_mission_mode
         if event.system_id == session.system_id and holds and hold_mode is not None:
             # At the end of a mission, the vehicle changes to this mode by itself. An order that is given now must not
-            # take this for a takeover.
+            # take the mode change for a takeover.
             self.vehicle_context.arbiter.expect_late(hold_mode)
 
 
@@ -318,7 +320,7 @@ class MissionTracker:
             cell.close(error)
 
     def _on_current(self, _: MissionProgress | None, reported: MissionProgress) -> None:
-        before = self.current.latest
+        current_before = self.current.latest
         current = None if reported.current is None else reported.current - self._offset
         if current is not None and current < 0:  # The current item is ArduPilot's item 0, which is home.
             current = None
@@ -333,18 +335,18 @@ class MissionTracker:
         self.current.set(current, self._source)
         if current is not None and current + 1 == count:  # The current item is the last one.
             self._last_item_current_at = self._session.connection.now()
-        if current != before:
-            self._detect_second_approach(before, current)
-            self._session.publish(MissionCurrentChanged, before, current)
+        if current != current_before:
+            self._detect_second_approach(current_before, current)
+            self._session.publish(MissionCurrentChanged, current_before, current)
         self._on_state(reported.state)
 
-    def _detect_second_approach(self, before: int | None, current: int | None) -> None:
+    def _detect_second_approach(self, current_before: int | None, current: int | None) -> None:
         """Detect that the vehicle flies once more to the item that it reached last."""
         if current is None or current != self.reached:
             return
         # PX4 may report an item as reached just before it reports the item as current. This is no second approach.
         is_long_ago = self._session.connection.now() - self._reached_at > SECOND_APPROACH_S
-        comes_from_later_item = before is not None and before > current
+        comes_from_later_item = current_before is not None and current_before > current
         if is_long_ago or comes_from_later_item:
             self._is_approached_again = True
 
@@ -363,12 +365,14 @@ class MissionTracker:
         self._mode_changed_at = self._session.connection.now()
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
+        if is_armed:
+            return
         # A vehicle that disarms on its way to a last waypoint has not flown the mission: it may have hit a slope.
         may_be_complete = self.is_last_item_reached or self._may_end_by_landing()
         was_at_end = self._has_begun and self.is_at_last_item and self.is_in_mission_mode
-        if not is_armed and was_at_end and may_be_complete:
+        if was_at_end and may_be_complete:
             self._complete()
-        elif not is_armed and not self._has_begun and self._session.connection.now() < self.stale_until:
+        elif not self._has_begun and self._session.connection.now() < self.stale_until:
             self.stale_until = math.inf  # This flight has not begun, so it cannot be complete.
 
     def _on_reached(self, _: int | None, seq: int) -> None:

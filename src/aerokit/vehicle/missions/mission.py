@@ -109,7 +109,8 @@ class MissionEndDetector:
         """Return True if the vehicle reports the end of the mission. A crashed vehicle may report it, too."""
         if self._tracker.is_present_plan_complete:
             return self._is_completion_final()
-        # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
+        # ArduPlane leaves the mission mode for the return. The mode change stops the mission, so that its completion is
+        # not reported.
         if self._ending is Ending.RETURN and self._is_landing:
             return self._is_on_ground or self._has_returned()
         # The mission is not complete. The vehicle may fly it once more, so earlier observations do not count.
@@ -199,9 +200,10 @@ class MissionEndDetector:
     @property
     def _is_landing(self) -> bool:
         """True if the vehicle executes the landing or the return that ends its mission."""
-        current, last = self._tracker.current.latest, self._tracker.last_item
+        current, last_item = self._tracker.current.latest, self._tracker.last_item
+        is_at_last_item = current is not None and current == last_item
         # If the items are unknown, the number of the current item does not matter.
-        is_at_end = (current is not None and current == last) or self._ending is Ending.UNKNOWN
+        is_at_end = is_at_last_item or self._ending is Ending.UNKNOWN
         return is_at_end and self._lands_or_returns and self._is_in_landing_mode
 
     @property
@@ -450,11 +452,11 @@ class MissionControl(VehiclePlan["Mission"]):
 
     def _check_item(self, item: int) -> None:
         count = self._tracker.count.latest
-        last = MAX_ITEM if count is None else count - 1
+        last_item = MAX_ITEM if count is None else count - 1
         if count == 0:
             raise InvalidArgument("the vehicle's mission is empty: call upload() first; nothing was sent")
-        if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last:
-            raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
+        if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last_item:
+            raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last_item}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
         vehicle_context, session = self._vehicle_context, self._session
@@ -528,7 +530,8 @@ class MissionControl(VehiclePlan["Mission"]):
         """Return True if PX4 has ended the mission before HEARTBEAT reported its mode, e.g. at the last waypoint."""
         end_text = self._session.autopilot.mission_end_text
         texts = self._session.texts_since(acknowledged_at)
-        return self._tracker.is_complete and end_text is not None and any(end_text in text for text in texts)
+        is_end_reported = end_text is not None and any(end_text in text for text in texts)
+        return is_end_reported and self._tracker.is_complete
 
     def _refusals(self, order: Order) -> tuple[str, ...]:
         """Return PX4's status texts, sent after the order, that it left the mode because it has no mission to fly."""

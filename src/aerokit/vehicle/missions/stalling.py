@@ -68,7 +68,8 @@ class MissionStallDetector:
         should_move = self._should_move(current)
         standstill = self._stall_detector()  # None unless the vehicle has stood still for 12 s
         # A standstill after a fast descent is a fall. In the air, the vehicle may instead hover at its current item.
-        if standstill is not None and self._stall_detector.follows_fast_descent and (should_move or self._is_on_ground):
+        may_have_fallen = standstill is not None and self._stall_detector.follows_fast_descent
+        if may_have_fallen and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.
             self._moving_item = current if should_move else None

@@ -88,7 +88,8 @@ class PlanChannel:
     async def receive(self, only: Sequence[int] | None = None) -> DownloadResult:
         """Read the items with the numbers ``only``; None: all items; empty: none, but their count."""
         options = self._wire_options
-        if only is not None and not only:
+        requests_only_count = only is not None and not only
+        if requests_only_count:
             options["on_progress"] = None  # A count is no progress.
         received = await self._run(
             MissionDownload(
@@ -105,8 +106,11 @@ class PlanChannel:
         """Read all items again until their number is still the same afterwards, unless the vehicle reports an id."""
         while True:
             received = await self.receive()
-            # If another station has replaced the plan by one with the same number of items, ArduPilot does not show it.
-            if received.opaque_id or (await self.receive(only=())).count == received.count:
+            if received.opaque_id:
+                return received
+            recounted = await self.receive(only=())
+            # ArduPilot does not show that another station has replaced the plan by one with the same number of items.
+            if recounted.count == received.count:
                 return received
 
     async def clear(self) -> None:
@@ -145,12 +149,12 @@ class PlanChannel:
         # upload (AP_Filesystem_Mission.cpp, read). The mission protocol refuses requests during an upload.
         if self.mission_type in self._context.autopilot.overwrites_plans_in_place:
             await self.receive(only=())
-        if data == previous_data:
+        if data == previous_data:  # Two reads in succession gave the same plan.
             return True
         try:
             crc = await self._context.files().crc32(self._path, idle_timeout_s=self._options["idle_timeout_s"])
         except FileError:
-            return True  # The vehicle cannot compute it.
+            return True  # The vehicle cannot compute a CRC-32.
         return crc == crc32(data)
 
     def _normalized(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
@@ -269,7 +273,8 @@ class PlanChannel:
         # PX4 may take the first items for those of an older, shorter upload, and its acceptance may have been lost.
         is_end_unknown = is_silent or result == MavMissionResult.ERROR
         may_be_cut = exchange.was_started and is_end_unknown and self._may_continue_older_upload
-        if (exchange.was_accepted_early or may_be_cut) and not overwrites_in_place:
+        may_have_first_items_only = exchange.was_accepted_early or may_be_cut
+        if may_have_first_items_only and not overwrites_in_place:
             return "; the vehicle may have accepted the first items as the whole plan: call download()"
         if is_partly_overwritten and refused_item:
             # After the upload of a file there are no later items, because ArduPilot has cleared its plan first.
@@ -281,7 +286,8 @@ class PlanChannel:
         if is_partly_overwritten:
             has = "may have" if is_silent else "has"
             return f"; the vehicle now {has} some new and some old items: upload again, or clear"
-        if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT alone cuts the plan.
+        may_have_cut_plan = overwrites_in_place and is_silent and not exchange.is_partial
+        if may_have_cut_plan:  # The request MISSION_COUNT alone cuts the plan.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
         if result == MavMissionResult.DENIED:  # Another station may be replacing the items.
             return "; it has stored none of the new items"
@@ -385,7 +391,8 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.forget(self._context.now())  # The plan stays unknown if this call fails or is cancelled.
         changes = self._cache.changes
         await anyio.sleep(FENCE_ERASED_WITHIN_S)
-        if (await self._channel.receive(only=())).count == 0:
+        received = await self._channel.receive(only=())  # Without item numbers, only the count is requested.
+        if received.count == 0:
             return True
         if uploaded is not None and self._cache.changes == changes:
             self._cache.set(uploaded, self._context.now())
@@ -436,9 +443,10 @@ class PlanTransfer(Generic[PlanT]):
             if not has_ftp:
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
-        # ArduPilot refuses a mission file while it flies a mission, because it would clear the old mission first.
+        # ArduPilot refuses a mission file while it flies a mission, because a new file first clears the old mission.
         is_refused = is_upload and self._mission_type == MavMissionType.MISSION and self._context.is_flying_mission
-        return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
+        may_have_file = self._cache.has_file is not False  # None until tried
+        return has_ftp and may_have_file and not is_refused
 
     def _on_file_error(self, error: Exception, method: str) -> None:
         """Raise the error, or use the mission protocol instead of files from now on."""
@@ -604,7 +612,8 @@ class PlanTransfer(Generic[PlanT]):
         return is_reported
 
     async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
-        self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
+        received_items = await self._read(method)
+        self._compare(dict(enumerate(items)), dict(enumerate(received_items)))
 
     def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:
         """Raise VerificationFailed if the items differ. Both mappings are keyed by seq."""

@@ -134,10 +134,10 @@ class ParameterAccess:
                 if method == "ftp":
                     raise
                 # The next download may succeed if the file was damaged, or if the vehicle had another file open.
-                is_temporary = isinstance(error, RemoteProtocolError) or (
-                    isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
-                )
-                self._has_file = None if is_temporary else False  # With None, the next download tries the file again.
+                is_damaged = isinstance(error, RemoteProtocolError)
+                is_busy = isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
+                # With None, the next download tries the file again.
+                self._has_file = None if is_damaged or is_busy else False
         await self._download_list(idle_timeout_s, on_progress)
 
     @contextmanager
@@ -253,11 +253,11 @@ class ParameterAccess:
         with self._raised_rate(raise_rate_after_s):
             return await transfers.run(exchange)
 
-    def _read_later(self, name: str, at: float) -> None:
-        """Schedule a background read of a parameter at the time ``at`` of the event loop's clock."""
+    def _read_later(self, name: str, due_at: float) -> None:
+        """Schedule a background read of a parameter at the time ``due_at`` of the event loop's clock."""
 
         async def read() -> None:
-            await anyio.sleep(at - self._transfers.connection.now())
+            await anyio.sleep(due_at - self._transfers.connection.now())
             self._read_later_names.discard(name)
             with suppress(AerokitError):
                 # The answer corrects the stored value, which may be wrong.
@@ -319,21 +319,21 @@ class ParameterAccess:
         old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
         self._forget_written(names)
         # Recently written parameters are verified by a read, which ArduPilot answers more slowly than a write.
-        recent = self._recently_written() & set(names)
+        recently_written = self._recently_written() & set(names)
         exchange = ParameterWrites(
             transfers.system_id,
             transfers.component_id,
             parameters,
             bytewise=self.store.bytewise,
             before=old_values,
-            recent=recent,
+            recent=recently_written,
             own_system=transfers.connection.source_system,
-            round_trip=self._read_round_trip if recent else transfers.round_trip,
+            round_trip=self._read_round_trip if recently_written else transfers.round_trip,
             idle_timeout_s=idle_timeout_s,
             on_progress=on_progress,
         )
         # A higher rate of PARAM_VALUE takes bandwidth from telemetry, so it is requested only for many reads.
-        raise_rate_after_s = 0.0 if len(recent) > MAX_READS_AT_DEFAULT_RATE else None
+        raise_rate_after_s = 0.0 if len(recently_written) > MAX_READS_AT_DEFAULT_RATE else None
         try:
             with self._raised_rate(raise_rate_after_s):
                 answers = await transfers.run(exchange)
@@ -397,8 +397,8 @@ class ParameterAccess:
         if method == "set":
             return await self.write(parameters, idle_timeout_s, on_progress)
         answers: dict[str, ParameterAnswer] = {}
-        # Another task must not write during the read-back. This call would take its value for a wrong one, and
-        # overwrite it.
+        # Another task must not write during the read-back. This call would take the other task's value for a wrong one,
+        # and overwrite it.
         async with self._write_lock:
             self._forget_written(_names(parameters))
             try:
@@ -472,7 +472,8 @@ class _CachedList:
         return vehicle_key(transfers.autopilot.name, transfers.system_id, transfers.version)
 
     async def _read_hash(self) -> int | None:
-        answer = (await self._access.read([HASH_NAME], self._idle_timeout_s))[HASH_NAME]
+        answers = await self._access.read([HASH_NAME], self._idle_timeout_s)
+        answer = answers[HASH_NAME]
         return int(answer.value) if isinstance(answer, Parameter) else None
 
 

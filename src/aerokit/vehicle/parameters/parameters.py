@@ -145,7 +145,8 @@ class Parameters(ReadOnly):
             ParameterTimeout: there was no answer.
         """
         with self._transfers.limit(timeout):
-            resolved = _value_or_raise((await self._names.resolve([name], idle_timeout_s))[name])
+            results = await self._names.resolve([name], idle_timeout_s)
+            resolved = _value_or_raise(results[name])
             if resolved.is_fresh:  # The parameter has just been read to resolve the name.
                 return resolved.as_requested(resolved.parameter)
             answers = await self._access.read([resolved.name], idle_timeout_s)

@@ -48,7 +48,7 @@ class ParameterStore:
         self.is_complete: bool = False
         # Increased by each value that arrives in a message, and by each reboot.
         self.updates: int = 0
-        self._forgotten_at = 0  # value of `updates` after the last reboot
+        self._updates_at_forget = 0  # value of `updates` after the last call of `forget`
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
         # Maps each name to the value of `updates` at the last message with this parameter.
@@ -100,7 +100,7 @@ class ParameterStore:
 
     def forget(self) -> None:
         self.updates += 1
-        self._forgotten_at = self.updates
+        self._updates_at_forget = self.updates
         self._known.clear()
         self._last_updates.clear()
         self._stale.clear()
@@ -115,7 +115,7 @@ class ParameterStore:
         precedence over the list. If the vehicle has rebooted since, the list is ignored.
         """
         # If the vehicle has rebooted since the request, it may have other values.
-        if updates_before < self._forgotten_at:
+        if updates_before < self._updates_at_forget:
             return
         newer_names = {name for name, last_update in self._last_updates.items() if last_update > updates_before}
         old, self._known = self._known, {}
@@ -143,7 +143,7 @@ class ParameterStore:
         frame = message.received_frame
         if frame is None or frame.component_id != self._transfers.component_id:
             return
-        if message.param_id == HASH_NAME or not message.param_id:
+        if message.param_id in ("", HASH_NAME):
             return  # The hash is sent like a parameter, but is not one.
         bytewise = self._was_bytewise = self.bytewise
         received = parameter_of(message, bytewise)
@@ -151,7 +151,8 @@ class ParameterStore:
         if old is None and len(self._known) >= MAX_PARAMETERS:
             return  # A faulty vehicle may send new names without end.
         stale = self.stale_value(name)
-        if old is not None and stale is not None and not same_value(received.value, old.value):
+        has_changed = old is not None and not same_value(received.value, old.value)
+        if has_changed and stale is not None:
             # This message is from before the last write, or another station has written the parameter.
             self._read_later(name, stale.ignored_until)
             if same_value(received.value, stale.value):

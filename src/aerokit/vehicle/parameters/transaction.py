@@ -98,14 +98,14 @@ class _Block:
     ) -> dict[str, ResolvedParameter | ParameterFailure]:
         results = await self._writer.names.resolve(names, idle_timeout_s)
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
-        fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
-        unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
+        fresh_parameters = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
+        unread_names = {answer.name for answer in resolved} - fresh_parameters.keys() - self._saved.keys()
         # Save the vehicle's present values, because the store may be outdated.
         answers = await self._access.read(unread_names, idle_timeout_s)
         if self._has_ended:  # A write by another task must not outlive the block, because nothing would restore it.
             raise InvalidArgument("the `async with` block has ended; the remaining parameters were not set")
         current: dict[str, Parameter] = {}
-        for name, answer in (answers | fresh).items():
+        for name, answer in (answers | fresh_parameters).items():
             if not isinstance(answer, Parameter):
                 raise answer
             # If another block has just restored the parameter, the answer may still be that block's temporary value.

@@ -80,7 +80,7 @@ class NameResolver:
         normalized = {check_name(name): self._normalized(name) for name in names}
         results: dict[str, ResolvedParameter | ParameterFailure] = {}
         store = self._access.store
-        await self._access.learn_encoding()  # This may clear the store.
+        await self._access.learn_encoding()  # The capabilities may arrive now, and clear the store.
         answers = await self._access.read(self._names_in_doubt(normalized.values()), idle_timeout_s)
         # If the vehicle reboots meanwhile, the store is cleared, and parameters that were known must also be read.
         while to_read := [name for name in self._unknown_names(normalized.values()) if name not in answers]:
@@ -226,7 +226,8 @@ def outcome_of(
         return "unchanged" if is_old_value else "set"
     # An integer that is sent as a 32-bit float may be rounded. An integer that is sent bytewise is exact.
     is_rounded = to_float32(answer.value) == to_float32(sent.value)
-    if is_old_value and (bytewise or not is_rounded):
+    was_refused = is_old_value and (bytewise or not is_rounded)
+    if was_refused:
         kept = number_text(answer.value) if math.isfinite(answer.value) else answer.value
         text = f"{sent.name} = {number_text(sent.value)} was refused: the vehicle keeps {kept}"
         return ParameterRejected(text, name=sent.name)
@@ -310,7 +311,7 @@ class ParameterWriter:
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
         """Send the planned values. The answers are keyed by the names on the vehicle."""
-        if upload is None:  # `write` sends each name once, even if two plans have it. It also sends unchanged values.
+        if upload is None:  # `write` sends each name once, even if two plans have it, and also sends unchanged values.
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
         # Two names may mean the same parameter, which must be in the file only once.
         changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}
@@ -374,10 +375,11 @@ def _plan_write(resolved: ResolvedParameter, value: int | float) -> _PlannedWrit
     return _PlannedWrite(resolved, value, Parameter(resolved.name, checked, kind))
 
 
-def _check_same_value(plan: _PlannedWrite, first: _PlannedWrite) -> None:
-    if not same_value(plan.to_send.value, first.to_send.value):
+def _check_same_value(plan: _PlannedWrite, other_plan: _PlannedWrite) -> None:
+    if not same_value(plan.to_send.value, other_plan.to_send.value):
+        other_name = other_plan.resolved.requested
         raise InvalidArgument(
-            f"{plan.resolved.requested} = {plan.requested:g} and {first.resolved.requested} = {first.requested:g}"
+            f"{plan.resolved.requested} = {plan.requested:g} and {other_name} = {other_plan.requested:g}"
             f" contradict each other: both names mean {plan.to_send.name} on this vehicle"
         )
 

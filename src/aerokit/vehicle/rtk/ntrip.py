@@ -75,9 +75,10 @@ class Caster:
             # The text of this error may contain the password. Without a host, the check below raises another error.
             parts, host, port = urlsplit(""), None, None
         mount = unquote(parts.path[1:])
-        is_mount_valid = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
+        has_only_valid_characters = mount.isascii() and mount.isprintable() and not set(mount) & set("/ ")
+        is_mount_valid = mount != "" and has_only_valid_characters
         is_scheme_valid = parts.scheme in ("ntrip", "ntrips")
-        if not host or not mount or not is_mount_valid or not is_scheme_valid or port == 0:
+        if not host or port == 0 or not is_mount_valid or not is_scheme_valid:
             raise InvalidArgument(
                 "url is invalid (it is not shown, because it may contain a password): write"
                 " ntrip://user:password@host:2101/MOUNT, with %40 for an @ in the password"
@@ -347,7 +348,8 @@ class NtripClient:
         """Return True if the source table says that the mount point needs the position (GGA)."""
         try:
             response = await self._request("")
-            return (await self._read_source_table(response)).get(self._caster.mount, False)
+            needs_position = await self._read_source_table(response)
+            return needs_position.get(self._caster.mount, False)
         finally:
             self._close()
 
@@ -408,6 +410,7 @@ def gga_sentence(session: VehicleSession) -> bytes | None:
 
 def _format_angle(degrees: float, *, degree_digits: int) -> str:
     """Format an angle as degrees and minutes: 4723.86456 is 47° 23.86456'."""
-    whole_degrees, rest = divmod(round(abs(degrees) * 60 * 100_000), 60 * 100_000)
-    minutes, fraction = divmod(rest, 100_000)
+    units_per_minute = 100_000  # for five decimal places
+    whole_degrees, units = divmod(round(abs(degrees) * 60 * units_per_minute), 60 * units_per_minute)
+    minutes, fraction = divmod(units, units_per_minute)
     return f"{whole_degrees:0{degree_digits}d}{minutes:02d}.{fraction:05d}"

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["Corrections", "Rtk"]
 
 BANDWIDTH_WINDOW_S = 10.0
-# If the program passes an equal message to another vehicle within this many seconds, it is not sent again. A base
-# station repeats its position (1005) after a second at the earliest.
+# If the program passes an equal message to another vehicle within this many seconds, the message is not sent again. A
+# base station repeats its position (1005) after a second at the earliest.
 REPEAT_WINDOW_S = 0.9
 MAX_RECENT = 64
 

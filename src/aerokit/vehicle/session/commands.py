@@ -238,9 +238,10 @@ class CommandSender:
         async with self._locks[key]:
             if self._is_closed:
                 raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
-            if order_status is not None and order_status.end != earlier_end and not was_just_sent:
+            order_end = "" if order_status is None else order_status.end
+            if order_end != earlier_end and not was_just_sent:
                 # The order ended while this call waited for an earlier command to complete.
-                text = f"{command_name(message.command)} was not sent: {order_status.end}"
+                text = f"{command_name(message.command)} was not sent: {order_end}"
                 raise CommandTimeout(text, was_sent=False)
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
@@ -326,9 +327,10 @@ class CommandSender:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         if frame is not None and self._copies.is_copy(frame):
-            return  # A copy could count as the ack of the next command with this MAV_CMD, even if that is lost.
+            return  # A copy could count as the ack of the next command with this MAV_CMD, even if that command is lost.
         run = self._runs.get(key)
         is_final = ack.result != MavResult.IN_PROGRESS
+        is_refusal = is_final and ack.result != MavResult.ACCEPTED
         is_expected = (run is not None or key in self._pending_acks) and self.is_for_us(ack)
         if is_expected and is_final:
             self._record_result(key, ack)
@@ -339,7 +341,7 @@ class CommandSender:
             self._pending_acks[key].pop(0)
             if not self._pending_acks[key]:
                 del self._pending_acks[key]
-        elif is_final and ack.result != MavResult.ACCEPTED and key in self._results and self._is_for_our_ids(ack):
+        elif is_refusal and key in self._results and self._is_for_our_ids(ack):
             self._on_unexpected_refusal(key, ack.result)
 
     def _on_unexpected_refusal(self, key: _Key, result: int) -> None:

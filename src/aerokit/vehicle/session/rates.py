@@ -217,10 +217,12 @@ class MessageRates:
         return stream
 
     async def _request_all_due(self) -> None:
-        while not self._uses_groups and (stream := self._most_urgent()) is not None:
-            await self._request_by_command(stream)
-        if self._uses_groups:
-            self._request_by_group()
+        while not self._uses_groups:
+            stream = self._most_urgent()
+            if stream is None:
+                return
+            await self._request_by_command(stream)  # This may set `_uses_groups`.
+        self._request_by_group()
 
     def _most_urgent(self) -> _Stream | None:
         now = self._connection.now()
@@ -316,7 +318,7 @@ class MessageRates:
 
     def _check_stream(self, stream: _Stream) -> None:
         stream.counts_at_checks.append(stream.received)
-        if stream.requested_hz is None or stream.requested_hz <= 0:
+        if stream.requested_hz is None or stream.requested_hz <= 0:  # There is no rate to compare with.
             return
         if stream.counts_at_checks[-1] == stream.counts_at_checks[0]:  # No message has arrived in the window.
             self._retry_if_due(stream)

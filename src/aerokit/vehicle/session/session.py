@@ -86,7 +86,8 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
                 await _request(commands, message_id)
         if mode_requests_left and not telemetry.has_available_modes:
             is_answered = await _request(commands, AvailableModes.ID)
-            mode_requests_left -= 1 if is_answered else 0
+            if is_answered:
+                mode_requests_left -= 1
         await anyio.sleep(RETRY_INTERVAL_S)
 
 

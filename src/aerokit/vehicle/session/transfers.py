@@ -124,14 +124,15 @@ class Transfers:
 
         def on_reboot(event: VehicleRebooted) -> None:
             nonlocal has_changed_boot
-            if event.system_id == self.system_id and connection.is_held_back(self.system_id) and not was_held_back:
+            is_on_reopened_link = connection.is_held_back(self.system_id)
+            if event.system_id == self.system_id and is_on_reopened_link and not was_held_back:
                 has_changed_boot = True
                 scope.cancel()
 
         with self.limit(timeout), anyio.CancelScope() as scope:
             if isinstance(exchange, Transfer) and exchange.on_progress is not None:
                 exchange.on_progress = _without_errors(exchange.on_progress)
-            detachers = [
+            detach_callbacks = [
                 self._end.on_end(lambda _: scope.cancel()),
                 connection.bus.attach_event(VehicleRebooted, on_reboot),
             ]
@@ -141,7 +142,7 @@ class Transfers:
                 self._append_link_description(error)
                 raise
             finally:
-                for detach in detachers:
+                for detach in detach_callbacks:
                     detach()
             if isinstance(result, dict):  # A request for several names returns one value or exception for each name.
                 for answer in result.values():

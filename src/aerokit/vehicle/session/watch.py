@@ -288,7 +288,7 @@ class VehicleWatch:
 
     def _on_held_back_frame(self, frame: Frame) -> None:
         """Compare the clock in a frame that arrived after a loss of the link with the clock before the loss."""
-        if not self._lost_clocks:  # There is no clock to compare with.
+        if not self._lost_clocks:  # Without a clock to compare with, a reboot is assumed.
             self._on_reboot_detected({})
             return
         if self._first_held_back_at is None:
@@ -360,7 +360,7 @@ class VehicleWatch:
             self._end_hold_back()
             return False
         if not is_speed_known:
-            return True
+            return True  # The confirmation below needs the speed.
         self._clock_read_at = reading.read_at
         resumed = self._resumed_readings.get(clock, reading)
         resumed_s = reading.read_at - resumed.read_at
@@ -397,7 +397,8 @@ class VehicleWatch:
         self._last_answer = _ClockReading(0, now)
         self._reboot_ordered_at = None
         self.reboots += 1
-        self.other_boots += self._deliver_again is not None
+        if self._deliver_again is not None:  # The link was reopened, and the vehicle's frames are held back.
+            self.other_boots += 1
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
         self._end_hold_back()  # The subscribers above can still see that the link was lost.

@@ -164,7 +164,7 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
     """Return the flight mode in CURRENT_MODE, which reports a change earlier than HEARTBEAT but lacks ``base_mode``."""
     # A custom_mode of 0 may mean "no mode", so only HEARTBEAT sets it. `base_mode` is known once HEARTBEAT has arrived.
-    if not message.custom_mode or context.before is None:
+    if not message.custom_mode or context.previous_value is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)
 

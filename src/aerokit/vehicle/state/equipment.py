@@ -168,24 +168,26 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
         max_distance_m=message.max_distance / 100,
         quality_percent=quality if quality > INVALID_QUALITY else None,  # 0 means "unknown", 1 "invalid"
     )
-    return _updated_entries(context.before, sensor, key=_id_of)
+    return _updated_entries(context.previous_value, sensor, key=_id_of)
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
     """Return all sensors reported so far. Older ArduPilot sends RANGEFINDER, which becomes sensor 0."""
     return _updated_entries(
-        context.before, RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN), key=_id_of
+        context.previous_value,
+        RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN),
+        key=_id_of,
     )
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
     """Return all receivers reported so far, the first one with the new values of this message."""
-    return _updated_entries(context.before, _gps_receiver(message, index=0), key=_index_of)
+    return _updated_entries(context.previous_value, _gps_receiver(message, index=0), key=_index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
     """Return all receivers reported so far, the second one with the new values of this message."""
-    return _updated_entries(context.before, _gps_receiver(message, index=1), key=_index_of)
+    return _updated_entries(context.previous_value, _gps_receiver(message, index=1), key=_index_of)
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
@@ -241,7 +243,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
         time_remaining_s=known(message.time_remaining, unknown=0),
         charge_state=enum_member(MavBatteryChargeState, message.charge_state),
     )
-    return _updated_entries(context.before, battery, key=_id_of)
+    return _updated_entries(context.previous_value, battery, key=_id_of)
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
@@ -251,7 +253,7 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
     if voltage is None and remaining is None:
         return None
     battery = Battery(0, voltage, current(message.current_battery, context.autopilot), remaining)
-    return _updated_entries(context.before, battery, key=_id_of)
+    return _updated_entries(context.previous_value, battery, key=_id_of)
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
@@ -281,7 +283,7 @@ def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOu
     # MAVLink 1 has no extension fields, so the message has only the first eight outputs of the port.
     count = 8 if frame is not None and frame.version == 1 else OUTPUTS_PER_PORT
     first_index = message.port * OUTPUTS_PER_PORT
-    outputs: list[int] = [] if context.before is None else list(context.before.outputs_us)
+    outputs: list[int] = [] if context.previous_value is None else list(context.previous_value.outputs_us)
     outputs += [0] * (first_index - len(outputs))  # the outputs of earlier ports that were not reported yet
     outputs[first_index : first_index + count] = _SERVOS(message)[:count]
     return ServoOutputs(tuple(outputs))

@@ -126,16 +126,16 @@ U8, U16, I16 = 0xFF, 0xFFFF, 0x7FFF
 
 
 class Context:
-    """Input of a decoder besides the message. ``before`` is the previous value of the state."""
+    """Input of a decoder besides the message. ``previous_value`` is the value of the state so far."""
 
-    __slots__ = ("autopilot", "base_mode", "before", "home_is_known", "mode_names")
+    __slots__ = ("autopilot", "base_mode", "home_is_known", "mode_names", "previous_value")
 
     def __init__(self, autopilot: Autopilot, mode_names: Mapping[int, str], home_is_known: Callable[[], bool]) -> None:
         self.autopilot: Autopilot = autopilot
         self.mode_names: Mapping[int, str] = mode_names
         self.home_is_known: Callable[[], bool] = home_is_known
         self.base_mode: int = 0
-        self.before: Any = None
+        self.previous_value: Any = None
 
 
 def enum_member(enum: type[int], value: int) -> int:

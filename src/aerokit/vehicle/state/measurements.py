@@ -216,7 +216,8 @@ def simulation_state(message: messages.SimState) -> Position | None:
     """Return the true position in ArduPilot's simulation (SIM_STATE)."""
     latitude, longitude = message.lat_int, message.lon_int
     # Firmware that does not send the extension fields lat_int and lon_int sends only lat and lon, which are less exact.
-    if not (latitude or longitude) and abs(message.lat) <= 90 and abs(message.lon) <= 180:
+    is_in_range = abs(message.lat) <= 90 and abs(message.lon) <= 180
+    if latitude == longitude == 0 and is_in_range:
         latitude, longitude = round(message.lat * 1e7), round(message.lon * 1e7)
     coordinates, altitude_m = valid_coordinates(latitude, longitude), finite(message.alt)
     return None if coordinates is None or altitude_m is None else Position(*coordinates, altitude_m)
@@ -245,7 +246,7 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None
 
-    earlier = [entry for entry in context.before or () if entry.icao != message.ICAO_address]
+    earlier = [entry for entry in context.previous_value or () if entry.icao != message.ICAO_address]
     reported = Aircraft(
         icao=message.ICAO_address,
         callsign=message.callsign.strip() if message.flags & AdsbFlags.VALID_CALLSIGN else "",

@@ -9,7 +9,7 @@ from aerokit.autopilots.failsafes import failsafe_kind
 from aerokit.vehicle.state.condition import StatusText
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
     from aerokit.mavlink.messages import Statustext
 
@@ -55,7 +55,7 @@ class StatusTextAssembler:
         if message.id == 0 and not joins_id_0:
             texts = [StatusText(message.severity, _text(chunk), now)]
         else:
-            texts = list(self._add_chunk(message, chunk, now))
+            texts = self._add_chunk(message, chunk, now)
         self._store(texts)
         return truncated_texts + texts
 
@@ -88,23 +88,25 @@ class StatusTextAssembler:
             if failsafe_kind(text.text):
                 self._failsafes.append(text)
 
-    def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
-        """Add a chunk, and yield the texts that are complete or truncated now."""
+    def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> list[StatusText]:
+        """Add a chunk, and return the texts that are complete or truncated now."""
+        ended_texts: list[StatusText] = []
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
                 # A router has forwarded this chunk twice. Copies that arrive over another link are dropped earlier, by
                 # `MergedStreams`.
-                return
+                return []
             # A new text with the same id begins, so the end of the previous text was lost.
-            yield self._incomplete.pop(key).truncated(now)
+            ended_texts.append(self._incomplete.pop(key).truncated(now))
             text = None
         if text is None:
             text = self._begin_text(key, message.severity)
         text.add(message.chunk_seq, chunk, now)
         if len(chunk) < CHUNK_LENGTH or text.next_seq >= MAX_CHUNKS:
-            yield self._incomplete.pop(key).complete(now)
+            ended_texts.append(self._incomplete.pop(key).complete(now))
+        return ended_texts
 
     def _begin_text(self, key: tuple[_Sender, int], severity: int) -> _IncompleteText:
         while len(self._incomplete) >= MAX_OPEN:

@@ -196,7 +196,7 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        # This is restored below, because a handler may read a cell, which decodes another message in a nested call.
+        # Calls may be nested, because a handler may read a cell, which decodes another message.
         outer_arrived_at = self._arrived_at
         # The cells get the time at which the frame arrived as their timestamp.
         self._arrived_at = None if frame is None else frame.received_at
@@ -244,7 +244,7 @@ class Telemetry(States):
             cell.set(value, source)
 
         def update_with_context(message: Any, source: Source) -> None:
-            context.before = cell.latest
+            context.previous_value = cell.latest
             value = decode(message, context)
             if value is not None:
                 # A message older than the value is not dropped, because the value may combine several message types.
@@ -302,7 +302,8 @@ class Telemetry(States):
     def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
         self.has_available_modes = True
         name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
-        if name is not None and (message.custom_mode in self._mode_names or len(self._mode_names) < MAX_MODE_NAMES):
+        can_store = message.custom_mode in self._mode_names or len(self._mode_names) < MAX_MODE_NAMES
+        if name is not None and can_store:
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
