@@ -274,7 +274,7 @@ class SteeringStream(ValueStream[ValueT]):
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
         """Order a hold. If the stream has already stopped, raise its error instead, unless it was raised before."""
         takeover_reason = self._takeover_reason() if self._stop_error is None else None
-        if takeover_reason is not None:
+        if takeover_reason:
             self._stop(takeover_reason, hold=False)  # This sets `_stop_error`.
         if self._stop_error is None:
             try:

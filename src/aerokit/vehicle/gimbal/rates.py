@@ -120,7 +120,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Stop the gimbal. If the stream has already stopped, raise its error instead."""
         takeover_reason = self._takeover_reason() if self._stop_error is None else None
-        if takeover_reason is not None:
+        if takeover_reason:
             self._stop(takeover_reason, hold=False)  # This sets `_stop_error`.
         if self._stop_error is None:
             # Create the command before `_end`, because afterwards it might address another gimbal.
