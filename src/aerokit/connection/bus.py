@@ -126,8 +126,8 @@ class Bus:
                     except Exception:
                         _report(entry.sink)
 
-        first = _Entry(FRAME, on_first)
-        detachers = [self._attach((system_id, message_id), first, ahead=True) for message_id in message_ids]
+        on_first_entry = _Entry(FRAME, on_first)
+        detachers = [self._attach((system_id, message_id), on_first_entry, ahead=True) for message_id in message_ids]
 
         def detach_all() -> None:
             for detach in detachers:

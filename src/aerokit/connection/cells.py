@@ -301,8 +301,8 @@ class StateCell(Generic[T]):
 
         def __getitem__(self, key: object) -> NoReturn:
             """Raise an error that suggests ``.value[…]``. Iteration over a cell also calls this method."""
-            camera = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
-            raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{camera}")
+            hint = ", or camera_at(number) for a camera" if self.name == "cameras" else ""
+            raise TypeError(f"{self.name} is a StateCell, not its value: use {self.name}.value[…]{hint}")
 
     def __bool__(self) -> NoReturn:
         """Raise TypeError, because ``if vehicle.armed:`` would always be true."""
@@ -347,9 +347,9 @@ class Changes(AsyncIterator[T]):
     async def __anext__(self) -> T:
         while self._total() == self._read_count or not self._cell.is_known:
             await self._next_arrival()
-        count = self._total()
-        self._missed += count - self._read_count - 1
-        self._read_count = count
+        total = self._total()
+        self._missed += total - self._read_count - 1  # 1 for the value that is returned
+        self._read_count = total
         return self._cell.value
 
     def _total(self) -> int:

@@ -297,14 +297,14 @@ class Connection:
         self.raise_if_ended()
         # New discoveries are queued while the earlier ones are yielded.
         with self.subscribe(VehicleFound, capacity=MAX_ROUTES) as discoveries:
-            known = {
+            earlier_events = {
                 source: discovery_event(heartbeat, self.last_heartbeat_at(*source), *source)
                 for source, heartbeat in self.heartbeats.items()
             }
-            for event in known.values():
+            for event in earlier_events.values():
                 if isinstance(event, VehicleFound):
                     yield event
-            yielded = set(known)
+            yielded = set(earlier_events)
             async for event in discoveries:
                 source = event.system_id, event.component_id
                 if source not in yielded:  # A component is found again if its heartbeat was forgotten meanwhile.

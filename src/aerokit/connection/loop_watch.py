@@ -113,7 +113,8 @@ class LoopWatch:
         self._check_sleep_at = now + CHECK_INTERVAL_S / 2
         has_slept = self._detect_sleep()
         is_timer_late = now > self._due + LATE_THRESHOLD_S
-        if not (self._is_catching_up or has_slept or is_timer_late):
+        may_have_waited = self._is_catching_up or has_slept or is_timer_late
+        if not may_have_waited:
             # Data that is read in time proves that the loop runs, so the timer need not fire. Postponing it costs less
             # than waking the process only for the timer.
             if self._timer is not None:  # None after close(), which must not start the timer again
@@ -147,9 +148,9 @@ class LoopWatch:
         """Report a suspension of the computer since the last call. Return True if there was one."""
         # `_suspended` subtracts two clock readings. Its result is too small if the process was preempted between the
         # readings. The true value never decreases, so the largest result so far is used.
-        before = self._suspended_before
-        self._suspended_before = max(before, self._suspended())
-        slept_s = self._suspended_before - before
+        suspended_before_s = self._suspended_before
+        self._suspended_before = max(suspended_before_s, self._suspended())
+        slept_s = self._suspended_before - suspended_before_s
         # A small difference is no sleep: on macOS, NTP may adjust only one of the two clocks.
         if slept_s <= LATE_THRESHOLD_S:
             return False

@@ -198,7 +198,8 @@ class Routes:
         route = self._routes.get((frame.system_id, frame.component_id))
         if route is None or frame.received_at - route.heartbeat_at > ROUTE_TIMEOUT_S:
             return False
-        return 0 < (route.sequence - frame.sequence) & 0xFF < 128
+        behind_by = (route.sequence - frame.sequence) & 0xFF
+        return 0 < behind_by < 128  # Behind by half of the 256 numbers or more means ahead.
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers to which a message for a component is sent.
@@ -228,7 +229,7 @@ class Routes:
 
         Returns True if the route was changed. ``is_signed`` is True if the frame is signed with our key.
         """
-        if frame.message_id in RADIO_MESSAGE_IDS:  # Anyone can forge it, so it moves no route.
+        if frame.message_id in RADIO_MESSAGE_IDS:  # Anyone can forge these messages, so they move no route.
             return False
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
@@ -239,7 +240,8 @@ class Routes:
         other = self._other_peer(source, peer)
         self._compare(other, route, frame)
         has_changed_port = is_same_host and other.has_replaced_route_peer(now, route.rate)
-        if has_changed_port or (is_silent and (needs_no_evidence or other.is_same_sender)):
+        may_take_over = is_silent and (needs_no_evidence or other.is_same_sender)
+        if has_changed_port or may_take_over:
             self._move_route(route, frame, peer)
             return True
         self._report(other, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
@@ -353,8 +355,9 @@ def _sequence_matches(frame: Frame, route: _Route, silent_s: float) -> bool | No
     # If frames were lost since the last heartbeat, the number is ahead of the expected one. At its usual rate, the peer
     # sends `rate * silent_s` frames in that time.
     max_ahead = 8 + 1.5 * route.rate * silent_s
-    # With a larger range, more than half of the 256 sequence numbers would match by chance.
-    return (frame.sequence - route.counters.expected) & 0xFF <= max_ahead if max_ahead < 128 else None
+    if max_ahead >= 128:  # More than half of the 256 sequence numbers would match by chance.
+        return None
+    return (frame.sequence - route.counters.expected) & 0xFF <= max_ahead
 
 
 def _boot_time_matches(frame: Frame, expected_ms: float, silent_s: float) -> bool | None:

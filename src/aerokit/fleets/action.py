@@ -236,16 +236,16 @@ class FleetAction:
 
     async def _wait_to_start(self, member: Member, delay_s: float) -> None:
         """Wait until the member may start. Raises OperationRejected or HeartbeatTimeout if it must not start."""
-        before = self._orders_before.get(member.name) or self._orders_of(member)
+        orders_before = self._orders_before.get(member.name) or self._orders_of(member)
         is_overruled = False
         if self._moves_members or self._kind is ActionKind.ARMS:  # All other kinds are checked only after a delay.
             # A landing without a delay is sent even if there is a newer action, because that action may fail.
             has_newer_action = not self._ends_flight and self._has_newer_action(member)
-            is_overruled = has_newer_action or self._has_order_since(member, before)
+            is_overruled = has_newer_action or self._has_order_since(member, orders_before)
         remaining_s = delay_s
         while remaining_s > START_TOLERANCE_S and not is_overruled:
             await self._wait(member, remaining_s)
-            is_overruled = self._has_order_since(member, before) or self._has_newer_action(member)
+            is_overruled = self._has_order_since(member, orders_before) or self._has_newer_action(member)
             # After a blocked event loop, the delays of several members may end at once. Each member then waits until
             # `stagger_s` after the last start.
             remaining_s = self._last_start_at + self._stagger_s - self._context.now()
@@ -306,15 +306,15 @@ class FleetAction:
         commands = arbiter.arm_commands_sent if is_arming else arbiter.disarm_commands_sent
         return _SentOrders(_newest_order(member), commands)
 
-    def _has_order_since(self, member: Member, before: _SentOrders) -> bool:
-        """Return True if the program has told the member to land, return or disarm since ``before``.
+    def _has_order_since(self, member: Member, orders_before: _SentOrders) -> bool:
+        """Return True if the program has told the member to land, return or disarm after ``orders_before``.
 
         For an action that arms, commands to arm count instead of those to disarm.
         """
         newest, command_count = self._orders_of(member)
-        must_land = newest is not before.newest and _is_ending_flight(member)
+        must_land = newest is not orders_before.newest and _is_ending_flight(member)
         # A command to disarm does not prevent a landing, because a vehicle in the air refuses to disarm.
-        return must_land or (not self._ends_flight and command_count > before.command_count)
+        return must_land or (not self._ends_flight and command_count > orders_before.command_count)
 
     async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
@@ -451,7 +451,8 @@ class FleetAction:
         # Members that still execute the action hold when it is cancelled. Members that have finished it need an order.
         for member in self._members:
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
-            if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
+            needs_hold = has_finished and member.is_flown_by_program and not self._has_newer_order(member)
+            if needs_hold:
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:

@@ -220,7 +220,8 @@ class Member:
 
     def _set_state(self, state: MemberState, reason: str) -> None:
         self.state, self.reason = state, reason
-        self.absences += not self.is_available
+        if not self.is_available:
+            self.absences += 1
 
     def _event_fields(self) -> tuple[float, int, str]:
         return self.vehicle.connection.now(), self.vehicle.system_id, self.name

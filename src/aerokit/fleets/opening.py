@@ -296,7 +296,8 @@ class _Discovery:
         names = [f"{name}/{system_id}" for name, ids in self._found.items() for system_id in ids]
         listed = ", ".join(names)
         if self._count is not None:
-            text = f"{self._passed_count + len(names) or 'none'} of {self._count} vehicles were found"
+            found_count = self._passed_count + len(names)
+            text = f"{found_count or 'none'} of {self._count} vehicles were found"
             if self._passed_count:
                 text += f", {self._passed_count} of them passed as vehicles"
             return f"{text}: {listed}" if names else text

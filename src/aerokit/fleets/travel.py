@@ -185,7 +185,8 @@ class Travel(SelectionBase):
             return await self._fly_to(action, targets, options, names=names, corridors=separation)
         heights_m = separation.heights_m
         result = await self._fly_in_layers(action, targets, options, heights_m)
-        result.skipped |= {name: self.members[name].status for name in names or targets if name not in heights_m}
+        reported_names = names or tuple(targets)
+        result.skipped |= {name: self.members[name].status for name in reported_names if name not in heights_m}
         return result
 
     def _check_plan(self, action: str, targets: Mapping[str, Position], plan: Deconfliction) -> None:
@@ -362,7 +363,7 @@ class Missions(SelectionBase):
                 await member.vehicle.mission.upload(
                     missions[member.name], timeout=timeout, max_distance_m=max_distance_m
                 )
-                # The plan may be replaced while other members still receive theirs.
+                # Read now, because this plan may be replaced while other members still receive their plans.
                 uploaded_items[member.name] = member.vehicle.mission._known_items
 
         result = await self._run("upload", upload, names=tuple(missions))
@@ -498,6 +499,6 @@ def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path
             position = item.replace(x=round(here.latitude_deg * 1e7), y=round(here.longitude_deg * 1e7)).position
         if position is not None:
             points.append(PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position))))
-    if is_reported_on_ground(member.vehicle.telemetry):  # The member climbs before it flies to the first item.
+    if is_reported_on_ground(member.vehicle.telemetry):  # The member first climbs to the altitude of the first item.
         points[0] = points[0].replace(up_m=max(point.up_m for point in points[:2]))
     return Path(member.name, points)

@@ -275,7 +275,8 @@ class Hub:
                 logger.exception("listener %r raised an exception; the others are still called", listener)
 
     def _on_change(self, kind: HubEventKind, sender: tuple[int, int], port: Port, other_port: Port | None) -> None:
-        if other_port is not None and other_port.endpoint == port.endpoint and kind == "route_changed":
+        is_same_endpoint = other_port is not None and other_port.endpoint == port.endpoint
+        if is_same_endpoint and kind == "route_changed":
             return  # The endpoint's IdentityGuard reports a change between two peers of the same endpoint.
         system_id, component_id = sender
         ids = f"{system_id}/{component_id}"

@@ -131,7 +131,8 @@ def _to_mavlink2(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
     """
     # MAVLink 2 truncates trailing zeros, but keeps at least one byte. MAVLink 1 does not truncate.
     payload = frame.payload.rstrip(b"\0") or frame.payload[:1]
-    body = bytes((len(payload), flags)) + frame.body[2:HEADER_LENGTH] + payload
+    header = bytes((len(payload), flags)) + frame.body[2:HEADER_LENGTH]  # Only these two bytes change.
+    body = header + payload
     return bytes((MAGIC_V2,)) + body + x25(body + crc_extra).to_bytes(2, "little")
 
 
@@ -178,8 +179,8 @@ class FrameSigner:
 
 
 MAX_JOINED_BYTES = 1200
-"""Frames sent together are joined up to this size, because IP fragments larger datagrams."""
-UNLIMITED = 1 << 62
+"""Frames sent together are joined up to this size, because IP splits larger datagrams into fragments."""
+UNLIMITED = 1 << 62  # more bytes than any link can have unsent
 MAX_RATE_LIMITS = 4096
 """Maximum number of (sender, message) pairs whose rate is tracked."""
 
@@ -305,7 +306,7 @@ class Port:
             self.flush(unix_time)
 
     def drop_orders(self) -> None:
-        self._drop(self._queue.expire(math.inf))
+        self._drop(self._queue.expire(now=math.inf))
 
     def drop_late(self, frame: Frame, target: tuple[int, int], arrived_at: float) -> None:
         kind = self._kind_of(frame.message_id, target)

@@ -186,8 +186,8 @@ class Router(Generic[PortT]):
         # This is the hot path for new frames of known streams. `route` processes frames that are out of order or may
         # return in a loop, and all frames while the tables of recent frames are full or have expired.
         recent, streams, port_number = self._recent, ingress.streams, ingress.number
-        is_full = now >= recent.rotate_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES
-        if out_of_order or ingress.echoes or is_full:
+        must_rotate = now >= recent.rotate_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES
+        if out_of_order or ingress.echoes or must_rotate:
             return [self.route(ingress, frame, now, is_out_of_order=frame in out_of_order) for frame in frames]
         newer, older, plans = recent.newer, recent.older, []
         record = port_number, self._newest_port, now
@@ -195,7 +195,7 @@ class Router(Generic[PortT]):
             body = frame.body
             plan = streams.get(body[4:9])  # system id, component id and message id
             if plan is not None:
-                identity = plan.identity | body[3] << 16 | frame.checksum
+                identity = plan.identity | body[3] << 16 | frame.checksum  # body[3] is the sequence number.
                 is_new = identity not in newer and identity not in older
                 # The first item of a record is the port of the earlier frame. A frame from the same port is no copy,
                 # because its sequence number and checksum are equal by chance.
@@ -215,7 +215,8 @@ class Router(Generic[PortT]):
         self, ingress: Ingress[PortT], frame: Frame, now: float, *, is_out_of_order: bool = False
     ) -> ForwardingPlan[PortT]:
         """Return the plan for a frame received at ``ingress``."""
-        # Hot path. Sender and target are numbers: system id + 256 · component id.
+        # Hot path. Sender and target are numbers: system id + 256 · component id. The sequence number and the sender's
+        # ids are the bytes 3 to 5 of `Frame.body`.
         body, message_id = frame.body, frame.message_id
         source = body[4] | body[5] << 8
         sender = self._senders.get(source)
@@ -301,7 +302,8 @@ class Router(Generic[PortT]):
         if first_port == number:
             # A restarted program numbers its frames from the start again, so its first command may equal an earlier
             # frame. A frame that was received at the same port and in sequence is therefore no copy.
-            is_copy, may_be_echo = is_out_of_order and age_s <= REPEAT_WINDOW_S, False
+            is_copy = is_out_of_order and age_s <= REPEAT_WINDOW_S
+            may_be_echo = False
         else:
             # A port that was added after the earlier frame arrived cannot have returned it.
             may_be_echo = number <= newest_port and age_s <= LOOP_WINDOW_S
@@ -313,7 +315,8 @@ class Router(Generic[PortT]):
             return self._duplicate
         # A late frame may have returned through a slow loop, or may equal the earlier frame by chance, like the first
         # command of a restarted program. It is forwarded until several frames prove a loop.
-        if may_be_echo and self._record_echo(ingress, identity >> 24, first_port, now):
+        source = identity >> 24
+        if may_be_echo and self._record_echo(ingress, source, first_port, now):
             return self._loop
         newer[identity] = (first_port, newest_port, now) if may_be_echo else (number, self._newest_port, now)
         return None

@@ -237,7 +237,7 @@ class RunningEndpoint:
         return port
 
     def _queue_above_bytes(self) -> int:
-        kind = self.link.address.partition(":")[0]
+        kind, _, _ = self.link.address.partition(":")
         if kind in UNBUFFERED_KINDS and isinstance(self.endpoint.address, str):
             return UNLIMITED
         return _min_queue_above_bytes(self.link.address)

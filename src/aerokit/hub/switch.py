@@ -131,7 +131,8 @@ class Switch:
             frames = self._without_late(port, frames, arrived_at)
             data = None
         plans = self.router.route_all(ingress, frames, arrived_at, out_of_order)
-        if data is None or self.recording is not None or not self._forward_together(plans, data):
+        is_forwarded = data is not None and self.recording is None and self._forward_together(plans, data)
+        if not is_forwarded:
             for frame, plan in zip(frames, plans, strict=True):
                 self._forward(port, frame.raw, plan, now)
         if self._ports_to_flush:

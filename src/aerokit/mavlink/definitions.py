@@ -221,14 +221,14 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
     merged: dict[str, EnumDefinition] = {}
     for dialect in dialects:
         for enum in dialect.enums:
-            first = merged.get(enum.name)
-            if first is None:
+            earlier = merged.get(enum.name)
+            if earlier is None:
                 merged[enum.name] = enum
                 continue
             # Only entries are merged: all else is from the first file's enum. For each name, the last entry is used.
-            entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
+            entries = {entry.name: entry for entry in (*earlier.entries, *enum.entries)}
             ordered = sorted(entries.values(), key=lambda entry: entry.value)
-            merged[enum.name] = replace(first, entries=tuple(ordered))
+            merged[enum.name] = replace(earlier, entries=tuple(ordered))
     return list(merged.values())
 
 

@@ -139,6 +139,7 @@ class _Standard(Dialect):
 
     def __init__(self) -> None:
         super().__init__("standard", ())
+        # A row of INDEX has the names of the class and its module before the three numbers.
         self._set_rows({message_id: row[2:] for message_id, row in messages.INDEX.items()})
 
     def __getitem__(self, message_id: int) -> type[Message]:

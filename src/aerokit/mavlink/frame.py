@@ -120,18 +120,19 @@ def is_whole_frame(data: bytes) -> bool:
         return False
     magic, payload_length, flags = data[:3]
     if magic == MAGIC_V1:
-        return len(data) == payload_length + 8
+        return len(data) == 6 + payload_length + 2  # header, payload and checksum
     signature_length = SIGNATURE_LENGTH if flags == SIGNED else 0
-    return flags <= SIGNED and len(data) == payload_length + 12 + signature_length
+    return flags <= SIGNED and len(data) == 10 + payload_length + 2 + signature_length
 
 
 def x25_in_python() -> Callable[[bytes], int]:
     """Create a checksum function in Python."""
     table: list[int] = []
     for byte in range(256):
+        crc = byte
         for _ in range(8):
-            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1  # 0x8408: reversed polynomial of CRC-16/MCRF4XX
-        table.append(byte)
+            crc = (crc >> 1) ^ 0x8408 if crc & 1 else crc >> 1  # 0x8408: reversed polynomial of CRC-16/MCRF4XX
+        table.append(crc)
 
     def x25(data: bytes) -> int:
         crc = 0xFFFF

@@ -141,7 +141,7 @@ class PythonFramer:
                         if flags:
                             frame._raw = data
                         return [frame]
-                except KeyError:
+                except KeyError:  # The sender or the message is unknown.
                     pass
         scan = _NEW_SCAN
         if self._rest:
@@ -398,9 +398,11 @@ else:
         def _add_source(self, key: int, sequence: int, now: float) -> SourceStatistics:
             return self.statistics.add_source(key, sequence, has_room=self._limit.make_room(now))
 
-        def _count_out_of_order(self, source: SourceStatistics, key: int, sequence: int, now: float, at: int) -> None:
+        def _count_out_of_order(
+            self, source: SourceStatistics, key: int, sequence: int, now: float, position: int
+        ) -> None:
             if ordering := source.out_of_order(sequence, now):
-                self._out_of_order.append(_OutOfOrder(at, ordering, sequence << 16 | key))
+                self._out_of_order.append(_OutOfOrder(position, ordering, sequence << 16 | key))
 
         def _sort_out_of_order(self, frames: list[Frame]) -> None:
             out_of_order, self._out_of_order = self._out_of_order, []

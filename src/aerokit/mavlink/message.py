@@ -316,7 +316,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
     """Explain why a value does not fit into this type, or return None."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
-        try:  # This finds values that are not integers. Their range is checked below.
+        try:  # Only values that are not integers are refused here, because the range is checked below.
             struct.pack("<q" if low < 0 else "<Q", value)
         except (struct.error, OverflowError, TypeError):
             if not hasattr(value, "__index__"):

@@ -119,11 +119,12 @@ def _sentence(text: str) -> str:
 
 def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
     texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
+    width = _WIDTH - len(indent) - 6  # The opening and the closing quotes have six characters.
     wrapped: list[str] = []
     for number, text in enumerate(texts):
         if number:  # An empty line separates paragraphs.
             wrapped.append("")
-        wrapped += textwrap.wrap(text, _WIDTH - len(indent) - 6, break_long_words=False, break_on_hyphens=False)
+        wrapped += textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
     if len(wrapped) == 1:
         # Without a space, a quotation mark would join the closing quotes.
         space = " " if wrapped[0].endswith('"') else ""
@@ -150,7 +151,8 @@ def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
         return [single]
     lines = [""]
     for item in items:
-        if lines[-1] and len(indent) + 4 + len(lines[-1]) + len(item) + 2 > _WIDTH:
+        width = len(indent) + 4 + len(lines[-1]) + len(item) + 2  # with 4 spaces of indentation, a space and a comma
+        if lines[-1] and width > _WIDTH:
             lines.append("")
         lines[-1] += f" {item}," if lines[-1] else f"{item},"
     return [head, *(f"{indent}    {line}" for line in lines), f"{indent}{tail}"]
@@ -202,12 +204,12 @@ def _default(field: FieldDefinition) -> str:
 def _render_init(message: MessageDefinition) -> list[str]:
     # In Python, a parameter without a default cannot follow one with a default, unless a "*" makes it keyword-only.
     arguments: list[str] = []
-    optional = False
+    follows_default = False
     for field in message.fields:
         default = _default(field)
-        if optional and not default and "*" not in arguments:
+        if follows_default and not default and "*" not in arguments:
             arguments.append("*")
-        optional = optional or bool(default)
+        follows_default = follows_default or bool(default)
         arguments.append(f"{field.attribute}: {_annotation(field, argument=True)}{default}")
     lines = _filled("    def __init__(", ["self", *arguments], ") -> None:", "    ")
     for field in message.fields:

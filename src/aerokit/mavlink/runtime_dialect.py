@@ -118,6 +118,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
 def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
     """Return the generated class if the wire formats are the same, otherwise None."""
     row = standard.rows.get(definition.id)
+    # A row has CRC_EXTRA, the base length and the length.
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None
     generated = standard[definition.id]

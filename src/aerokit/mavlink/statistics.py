@@ -168,7 +168,8 @@ class SourceStatistics(SourceFields):
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
         # Links may repeat two or three recent frames, so only four in a row show a reboot. Links hardly ever repeat
         # older frames, so two are enough.
-        if self._repetitions >= (4 if is_near else 2):
+        min_repetitions = 4 if is_near else 2
+        if self._repetitions >= min_repetitions:
             self._begin_stream(now)
             self._continue_at(sequence)
             return IN_ORDER
@@ -204,7 +205,8 @@ class SourceStatistics(SourceFields):
             other_count = self._other_count if is_other_longer else 0
             self._swap_streams(sequence, now, current_count=current_count, other_count=other_count)
             return IN_ORDER
-        if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
+        behind = (self.expected - sequence) & 0xFF or 256  # 1 to 256 places before `expected`
+        if is_other_longer and self._consume_missing(behind):
             # The frame was counted as lost, because it is in the gap between the sequence numbers of the streams.
             self.lost -= 1
             self._skipped_over -= 1

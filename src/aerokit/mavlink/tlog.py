@@ -18,7 +18,7 @@ from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
 _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
-_MAX_RECORD = 8 + 280
+_MAX_RECORD = 8 + 280  # the time and the longest frame
 # After garbage, a time before the year 2000 does not begin a record, because zeros in a frame's header look like one.
 # Directly after another record, such a time is accepted, because the computer's clock may be wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
@@ -79,7 +79,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
         except IndexError:  # The data ends here, so this is the last record, or garbage.
             end = _record_end(data, begin, min_time)
         if end is None:
-            if len(data) - begin <= 8:
+            if len(data) - begin <= 8:  # The rest of the file is too short for a record.
                 return
             begin, min_time = begin + 1, _FIRST_TIME  # No record begins here: search from the next byte on.
             continue

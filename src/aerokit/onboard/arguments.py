@@ -118,7 +118,7 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
 def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandArgument:
     allowed = Range()
     is_optional = False
-    while (origin := get_origin(hint)) in (Annotated, Union, types.UnionType):  # They may be nested.
+    while (origin := get_origin(hint)) in (Annotated, Union, types.UnionType):  # These may be nested.
         if origin is Annotated:
             hint, *extras = get_args(hint)
             for extra in extras:

@@ -274,8 +274,10 @@ class _Execution:
             return
         if result is not None:
             self._finish(result)
-        elif self._commands._tasks.start(self._run, f"aerokit {command_name(running.command.command)}") is None:
-            self.cancel()  # The component is closing.
+            return
+        task = self._commands._tasks.start(self._run, f"aerokit {command_name(running.command.command)}")
+        if task is None:  # The component is closing.
+            self.cancel()
 
     def cancel(self) -> bool:
         """Cancel the handler. Return False if it runs in a thread, which cannot be cancelled."""

@@ -24,7 +24,8 @@ MAX_ENTRIES = 10_000
 # Flags for `os.open`, if the platform has them: follow no symbolic link, do not convert line ends, do not wait for the
 # other end of a pipe.
 _SAFE_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
-# Linux's error numbers, which MAVFTP clients expect on every platform.
+# Linux's error numbers, which MAVFTP clients expect on every platform. ELOOP means a symbolic link, which clients
+# must not see.
 _ERROR_NUMBERS = {errno.ENOTEMPTY: 39, errno.ELOOP: ENOENT, errno.ENAMETOOLONG: 36}
 
 
@@ -133,8 +134,8 @@ class DirectoryFiles:
             except (OSError, FileFault):
                 if path not in self._memory:  # A directory in memory need not exist on the disk.
                     raise
-        if self.root is None or path in self._memory:  # If only memory is served, this raises for an unknown path.
-            sizes.update(self._memory.entries(path))
+        if self.root is None or path in self._memory:
+            sizes.update(self._memory.entries(path))  # Without a root, an unknown path raises here.
         return [Entry(name, size) for name, size in sorted(sizes.items())]
 
     @_raises_file_fault
@@ -181,7 +182,8 @@ class DirectoryFiles:
         parts = [part for part in path.split("/") if part not in ("", ".")]
         for part in parts:
             has_windows_colon = os.name == "nt" and ":" in part  # a drive, or a second stream of a file
-            if part == ".." or "\0" in part or "\\" in part or has_windows_colon:
+            is_forbidden = part == ".." or "\0" in part or "\\" in part or has_windows_colon
+            if is_forbidden:
                 raise FileFault(EINVAL)
             if "\ufffd" in part:  # The name was not valid UTF-8.
                 raise FileFault(ENOENT)

@@ -81,8 +81,9 @@ class ComponentHost:
 
         def on_message(message: Message) -> None:
             sender = sender_of(message)
-            is_for_us = not self._is_closed and self._is_addressed(message, sender)
-            if is_for_us and not self._is_copy(message) and not self._is_late(message):
+            if self._is_closed or not self._is_addressed(message, sender):
+                return
+            if not self._is_copy(message) and not self._is_late(message):
                 self._run_and_log_errors(lambda: handler(message, sender))
 
         self._detachments.append(self.connection.bus.attach(message_class, on_message))
@@ -137,7 +138,7 @@ class ComponentHost:
         if len(text) <= CHUNK_SIZE:
             self.send(m.Statustext(severity, text, id=0, chunk_seq=0))  # id 0 means that the text has only one chunk.
             return
-        self._text_id = self._text_id % 0xFFFF + 1
+        self._text_id = self._text_id % 0xFFFF + 1  # 1 to 65535
         for number, start in enumerate(range(0, len(text), CHUNK_SIZE)):
             chunk = text[start : start + CHUNK_SIZE]
             self.send(m.Statustext(severity, chunk, id=self._text_id, chunk_seq=number))

@@ -56,7 +56,7 @@ class Identity(Snapshot):
             raise InvalidArgument(
                 f"version = {self.version!r} is not allowed: it must be one to four numbers up to 255, such as '1.4.2'"
             )
-        major, minor, patch, release_type = [*map(int, parts), 0, 0, 0][:4]
+        major, minor, patch, release_type = [*map(int, parts), 0, 0, 0][:4]  # Numbers that are not given are 0.
         return major << 24 | minor << 16 | patch << 8 | release_type
 
 

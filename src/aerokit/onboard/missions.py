@@ -140,9 +140,11 @@ class ComponentMissions:
             return False
 
     async def _do_set_current(self, _: CommandRequest, index: int) -> None:
-        is_known = 0 <= index < len(self.items())
-        # This coroutine runs on the event loop, so it may send. The program's function may run in a thread.
-        if not is_known or self._on_current is None or await self._commands.call(self._on_current, index) is False:
+        is_accepted = False
+        if 0 <= index < len(self.items()) and self._on_current is not None:
+            # This coroutine runs on the event loop, so it may send. The program's function may run in a thread.
+            is_accepted = await self._commands.call(self._on_current, index) is not False
+        if not is_accepted:
             raise InvalidArgument(f"the mission cannot continue at item {index}")
         self.set_current(index)
 

@@ -124,6 +124,7 @@ class ReceivedCorrections:
 
     def _on_fragment(self, message: GpsRtcmData) -> None:
         data = bytes(message.data[: message.len])
+        # Bit 0 of the flags marks a fragment, bits 1 and 2 are the fragment's id, and bits 3 to 7 the sequence number.
         is_fragmented = message.flags & 1
         fragment_id = message.flags >> 1 & 3
         sequence = message.flags >> 3

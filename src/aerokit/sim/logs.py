@@ -145,7 +145,8 @@ class LogServer:
         if transfer != self._transfer_number:  # This transfer was aborted or replaced.
             return
         for _ in range(min(self.burst, len(self._outgoing))):
-            self._vehicle.send(self._outgoing.popleft()(), self._channel)
+            build = self._outgoing.popleft()
+            self._vehicle.send(build(), self._channel)
         if self._outgoing:
             self._vehicle.call_later(self.burst / self.rate_hz, lambda: self._send_next(transfer))
 

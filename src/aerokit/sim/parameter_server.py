@@ -90,7 +90,7 @@ class ArduPilotParameterServer(ParameterServer):
         self.start_list(channel)
 
     def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
-        if len(self._reads) >= _QUEUE_DEPTH:
+        if len(self._reads) >= _QUEUE_DEPTH:  # The queue is full, so the request is lost.
             return
         self._reads.append((request, channel))
         if not self._is_reading:
@@ -162,7 +162,7 @@ class Px4ParameterServer(ParameterServer):
         return value_message(parameter, len(self._parameters), bytewise=True)
 
     def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
-        if request.target_system == 0:
+        if request.target_system == 0:  # PX4 ignores a request to all systems.
             return
         if channel not in self._lists:
             self._send_hash(channel)

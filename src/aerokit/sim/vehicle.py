@@ -268,7 +268,7 @@ class SimulatedVehicle:
 
     def cancel_timers(self, owner: object) -> None:
         """Cancel all calls that were scheduled for this owner."""
-        self._timers = [timer for timer in self._timers if timer[-1] is not owner]
+        self._timers = [timer for timer in self._timers if timer[-1] is not owner]  # The owner is the last value.
         heapify(self._timers)
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
@@ -323,7 +323,7 @@ class SimulatedVehicle:
 
     def _run_due(self, due: float) -> None:
         self._tick_until(due)
-        while self._timers and self._timers[0][0] <= due:
+        while self._timers and self._timers[0][0] <= due:  # The time of a timer is its first value.
             _, _, action, _ = heappop(self._timers)
             action()
         for channel in self.channels:

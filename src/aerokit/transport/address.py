@@ -183,8 +183,10 @@ class _Parser:
             return self.parse_serial("serial", text, {}, has_scheme=False)
         if ":" not in text:
             raise self.error("it is neither host:port nor the path of a serial port or of a .tlog file")
-        if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
-            raise self.scheme_error(text.partition(":")[0])  # e.g. "upd:127.0.0.1:14550"
+        before_port, _, _ = text.rpartition(":")
+        has_unknown_scheme = text.count(":") > 1 and not text.startswith("[") and not _is_ipv6(before_port)
+        if has_unknown_scheme:  # e.g. "upd:127.0.0.1:14550"
+            raise self.scheme_error(text.partition(":")[0])
         return self.parse_network("udpin", text, {})
 
     def parse_network(self, kind: LinkKind, text: str, options: Options) -> LinkAddress:
@@ -315,10 +317,10 @@ class _Parser:
             raise self.error(f"{what} {text!r} is not a whole number")
         return int(text)
 
-    def missing_colon_error(self, scheme: str, begin: str, text: str) -> InvalidArgument:
+    def missing_colon_error(self, scheme: str, matched: str, text: str) -> InvalidArgument:
         if scheme not in _SCHEMES:
             return self.error(f"it is neither host:port nor the path of a serial port{did_you_mean(scheme, _SCHEMES)}")
-        return self.error(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
+        return self.error(f"a colon is missing: write {scheme}://{text[len(matched) :]}")
 
     def scheme_error(self, scheme: str) -> InvalidArgument:
         reason = "unknown kind of link"

@@ -212,7 +212,7 @@ class MultiLink(Link):
             if error is None:
                 return
             logger.debug("the link still cannot be opened: %s", error)
-            # Only the first failed retry is reported. Nobody had subscribed to events when open() failed.
+            # Only the first failed retry is reported: open() failed before the program could subscribe to events.
             if not is_reported and isinstance(self._receiver, MemberLinkListener):
                 is_reported = True
                 self._receiver.member_link_open_failed(member.index, error)
@@ -227,6 +227,7 @@ class MultiLink(Link):
     def _check_all_lost(self) -> None:
         """If no link is available, report an interruption or a loss."""
         receiver, error = self._receiver, self._last_loss
+        # No link was lost, this link has ended, or open() calls this method again at its end.
         if error is None or receiver is None or self._is_opening:
             return
         is_reported = self._lost_at is not None

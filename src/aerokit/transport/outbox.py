@@ -145,7 +145,7 @@ class Outbox:
 
     def _flush(self) -> None:
         self._drop_outdated()
-        while self._waiting and not self._is_full and not self._is_stalled and not self._is_closed:
+        while self._waiting and not (self._is_full or self._is_stalled or self._is_closed):
             self._forward_joined()
 
     def _forward_joined(self) -> None:
@@ -192,6 +192,7 @@ class Outbox:
             self._set_stalled(False)
         elif now - self._progress_at >= STALLED_AFTER_S:
             self._set_stalled(True)
+        # The callback `on_stalled` may have written data, which starts the timer, or closed this outbox.
         if self._timer is None and not self._is_closed and not is_idle:
             self._schedule_poll()
 

@@ -97,7 +97,8 @@ class SerialLink(BaseLink):
         self._released.clear()
         _replace_port_methods(self._port, self._device_failed)
         self._port.write = partial(self._write_in_time, self._port.write)
-        limit = max(4096, int(self._baud / 10 * _MAX_BUFFER_S))
+        bytes_per_s = self._baud / 10  # 8N1 sends a start bit and a stop bit with the eight bits of each byte.
+        limit = max(4096, int(bytes_per_s * _MAX_BUFFER_S))
         # The transport must buffer nothing itself: data that the driver does not accept waits in the outbox, where it
         # can be discarded.
         self._transport.set_write_buffer_limits(high=0)

@@ -238,7 +238,8 @@ class TcpListen(_TcpLink):
     def _on_connected(self, stream: _Stream) -> None:
         # The host is unknown if the client has already disconnected.
         host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
-        if (host and not self._allowed.allows(host)) or not self._make_room():
+        is_forbidden = bool(host) and not self._allowed.allows(host)
+        if is_forbidden or not self._make_room():
             stream.close()
         else:
             self._clients[stream.peer] = stream

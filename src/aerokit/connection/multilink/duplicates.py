@@ -138,7 +138,8 @@ class _Stream:
 
     def has_newer(self, frame: Frame) -> bool:
         """Return True if a frame with a newer sequence number was already accepted."""
-        return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
+        ahead_by = (frame.sequence - self.newest_sequence) & 0xFF
+        return self.newest_sequence >= 0 and ahead_by >= 128  # Ahead by half of the 256 numbers or more means behind.
 
     def count_acknowledgement(self, payload: bytes, link: int) -> bool:
         """Count the arrival of an acknowledgement. Return True if it repeats one that arrived over another link.
@@ -259,6 +260,6 @@ def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool
     used = choice.used
     if used is None or used.link != link or frame.message_id != m.Heartbeat.ID:
         return False
-    # If no other link carries the same frames, each link has its own stream of heartbeats, and two of them can be equal
-    # by chance.
+    # The content of heartbeats rarely changes. If no other link carries the same frames, each link has its own stream
+    # of heartbeats, and two of them can be equal by chance.
     return not choice.carries_same_stream(used, frame.received_at)

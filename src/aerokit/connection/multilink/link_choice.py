@@ -77,8 +77,8 @@ class Candidate:
     def record_round_trip(self, seconds: float, now: float) -> None:
         self.answered_at = now
         self.received_at = now
-        before = self.round_trip_s
-        self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
+        average_s = self.round_trip_s
+        self.round_trip_s = seconds if average_s is None else 0.7 * average_s + 0.3 * seconds
 
     def record_clock(self, matches: bool, *, awaits_hardware: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
@@ -89,8 +89,9 @@ class Candidate:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
         else:
             self._clock_matches, self._clock_mismatches = 0, self._clock_mismatches + 1
-        # The hardware id is stronger evidence than the clock.
-        if self._clock_matches >= MIN_CLOCK_MATCHES and not awaits_hardware and not self.is_other_hardware:
+        # The hardware id is stronger evidence than the clock, so matches do not count while it is awaited or differs.
+        do_matches_count = not awaits_hardware and not self.is_other_hardware
+        if self._clock_matches >= MIN_CLOCK_MATCHES and do_matches_count:
             self.is_same_vehicle = True
         elif self._clock_mismatches >= MIN_CLOCK_MATCHES:
             self._mark_as_other_vehicle()
@@ -179,7 +180,7 @@ SAME_STREAM_MAX_AGE_S = 5.0
 MAX_COST_RATIO = 0.5
 MIN_BETTER_S = 3.0
 
-JITTER_S = 0.05
+JITTER_S = 0.05  # assumed variation of the transit time over a link
 
 # A switch to a better link waits until no command is in transit, but not longer than this, because during a continuous
 # stream of set-points a command is always in transit.
@@ -272,7 +273,8 @@ class LinkChoice:
     def may_be_used(self, candidate: Candidate) -> bool:
         if candidate.is_other_hardware:
             return False
-        return self.used in (None, candidate) or candidate.is_same_vehicle is True or not self.has_autopilot
+        needs_proof = self.has_autopilot and self.used not in (None, candidate)
+        return not needs_proof or candidate.is_same_vehicle is True
 
     def carries_same_stream(self, candidate: Candidate, now: float) -> bool:
         """Return True if equal frames have recently arrived over this link and over the link in use.
@@ -317,8 +319,8 @@ class LinkChoice:
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
-        alive = [link for link in self.candidates.values() if link.is_alive(now)]
-        return candidate.was_same_vehicle and is_same and alive == [candidate]
+        is_only_link = [other for other in self.candidates.values() if other.is_alive(now)] == [candidate]
+        return candidate.was_same_vehicle and is_same and is_only_link
 
     def _awaits_hardware(self, candidate: Candidate) -> bool:
         can_compare_ids = self.hardware is not None and candidate.hardware is not None

@@ -283,7 +283,7 @@ class MultiLinkRoutes:
     def update(self, now: float) -> None:
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
-                # `record_counts` updates `received_at`, which may be too old to compare if the event loop was blocked.
+                # This updates `received_at`, which would otherwise be too old after a pause of the event loop.
                 if counters := self._counters.get((system_id, link), {}).values():
                     received = sum(counter.received for counter in counters)
                     lost = sum(counter.lost for counter in counters)
@@ -309,7 +309,7 @@ class MultiLinkRoutes:
     def _peers_on(self, link: int, system_id: int, component_id: int) -> Collection[Peer]:
         """Return the peers on this link that get a message for a component."""
         peers = self._routes[link].peers_of(system_id, component_id)
-        # If the route has expired, all peers of the link get the message.
+        # If the route has expired, `peers` is EVERY_PEER, so all peers of the link get the message.
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:

@@ -79,7 +79,7 @@ class AccelerometerCalibration:
     def _send_until_confirmed(self, run_number: int, position: int) -> None:
         if run_number != self._run_number or self._requested != position:
             return
-        self._vehicle.send_command((0, 0), MavCmd.ACCELCAL_VEHICLE_POS, float(position))
+        self._vehicle.send_command((0, 0), MavCmd.ACCELCAL_VEHICLE_POS, float(position))  # to all systems
         self._vehicle.call_later(_REPEAT_INTERVAL_S, lambda: self._send_until_confirmed(run_number, position))
 
 

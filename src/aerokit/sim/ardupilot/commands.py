@@ -166,7 +166,8 @@ class _CommonCommands:
         vehicle, guided = self._vehicle, self._vehicle.guided
         if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return Result.UNSUPPORTED
-        if vehicle.mode is not guided and not to_int(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+        may_change_mode = bool(to_int(command.param2) & MavDoRepositionFlags.CHANGE_MODE)
+        if vehicle.mode is not guided and not may_change_mode:
             return Result.DENIED
         point = vehicle.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
@@ -272,6 +273,7 @@ class _CommonCommands:
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
         point = vehicle.world_point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
-        if point is None or place == (0, 0) or not vehicle.navigation.set_origin(point):
+        if point is None or place == (0, 0):
             return
-        vehicle.send_built(m.GpsGlobalOrigin.ID, channel)
+        if vehicle.navigation.set_origin(point):
+            vehicle.send_built(m.GpsGlobalOrigin.ID, channel)

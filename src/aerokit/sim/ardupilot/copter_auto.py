@@ -243,7 +243,8 @@ class CopterAuto(MissionMode):
             return True  # Arming enters the current mode again, which must not restart the mission.
         if not run.is_present and not force:
             return False
-        if copter.is_armed and copter.is_landed and not run.starts_with_take_off():
+        must_take_off = copter.is_armed and copter.is_landed
+        if must_take_off and not run.starts_with_take_off():
             copter.send_text(MavSeverity.CRITICAL, "Auto: Missing Takeoff Cmd")
             return False
         self.speed = copter.speed_limit("WPNAV_SPEED")
@@ -259,7 +260,8 @@ class CopterAuto(MissionMode):
     def update(self, dt: float) -> None:
         self.start_if_origin_known()
         if not self.is_waiting_for_origin:
-            if self._update_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
+            has_changed = self._update_upcoming()
+            if has_changed and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
                 self._restart_command()
             self.vehicle.mission.update()
             self._update_upcoming()  # `mission.update` may have started the next command
@@ -334,7 +336,8 @@ class CopterAuto(MissionMode):
             return False
         if not self._has_leg_ended(index, item):
             return False
-        if int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND and copter.mission.is_take_off(index + 1):
+        may_continue = bool(int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND)
+        if may_continue and copter.mission.is_take_off(index + 1):
             return True
         copter.arming.disarm()
         return False

@@ -325,6 +325,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
             self.vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
-        if not self.forbids_modes() or not self.vehicle.is_armed or self.vehicle.is_landed:
+        is_flying = self.vehicle.is_armed and not self.vehicle.is_landed
+        if not is_flying or not self.forbids_modes():
             return None
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"

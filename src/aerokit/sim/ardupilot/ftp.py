@@ -133,7 +133,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.refuse(MavFtpErr.FAIL)
 
     def _path(self, request: FtpPacket) -> str:
-        length = len(request.data.partition(b"\0")[0])
+        path, _, _ = request.data.partition(b"\0")
+        length = len(path)
         # The length, with or without the final NUL, must be the request's `size`.
         if request.size == 0 or request.size - length not in (0, 1):
             raise Refused(MavFtpErr.INVALIDDATASIZE)

@@ -166,7 +166,8 @@ def _signed(value: int, bits: int) -> float:
     return float(value - (1 << bits) if value >> bits - 1 else value)
 
 
-# Maps a storage type to the function that converts an uploaded value to the value that a download returns.
+# Maps a storage type to the function that converts an uploaded value to the value that a download returns. The types
+# f, e, B, H, b and h are those of the module `struct`.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     _NOT_STORED: lambda _: 0.0,
     "f": float32,
@@ -175,9 +176,9 @@ _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "H": lambda value: float(to_int(value) & 0xFFFF),
     "b": lambda value: _signed(to_int(value), 8),
     "h": lambda value: _signed(to_int(value), 16),
-    "c": lambda value: float32((to_int(value * 100.0) & 0xFFFF) * float32(0.01)),
+    "c": lambda value: float32((to_int(value * 100.0) & 0xFFFF) * float32(0.01)),  # hundredths
     "r": lambda value: math.copysign(float(to_int(abs(value)) & 0xFFFF), value) + 0.0,
-    "s": lambda value: -1.0 if value < 0 else 1.0,
+    "s": lambda value: -1.0 if value < 0 else 1.0,  # only the sign
     "+": lambda value: 1.0 if value > 0 else 0.0,
     "1": lambda value: float(to_int(value) & 1),
     "2": lambda _: 2.0,

@@ -96,7 +96,8 @@ class CommandList(ItemList):
     def put(self, seq: int, item: MissionItem, last: int) -> None:
         stored_item = as_stored(item, self._kind)
         target = stored_item.param1
-        if stored_item.command == Cmd.DO_JUMP and (target == 0 or target > max(last, self.count - 1)):
+        leads_nowhere = target == 0 or target > max(last, self.count - 1)
+        if stored_item.command == Cmd.DO_JUMP and leads_nowhere:
             raise ItemRefused(MavMissionResult.ERROR)
         self._write(seq, stored_item)
 

@@ -317,7 +317,7 @@ class MissionRun:
         return False
 
     def _start_next_do(self) -> None:
-        if not self._last_do_index:
+        if not self._last_do_index:  # No further "do" command belongs to the running navigation command.
             return
         command = self._next_command(self._last_do_index + 1, count_jumps=False)
         if command is None or is_navigation(command.item):
@@ -368,8 +368,8 @@ class MissionRun:
         if item.command == Cmd.DO_JUMP:
             return int(item.param1)
         for index in range(_FIRST, self._list.count):
-            tag = self._list.command(index)
-            if tag is not None and tag.command == Cmd.JUMP_TAG and tag.param1 == item.param1:
+            target = self._list.command(index)
+            if target is not None and (target.command, target.param1) == (Cmd.JUMP_TAG, item.param1):
                 return index
         return 0
 

@@ -34,7 +34,7 @@ from aerokit.sim.missions import float32
 from aerokit.sim.vehicle import sender_of
 
 _DEGREE = 1e7
-_GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3
+_GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3  # values of `current` in items for GUIDED, which are not stored
 _FENCE_UPDATE_INTERVAL_S = 0.1
 
 
@@ -118,14 +118,16 @@ class ArduPilotMissionServer(MissionServer):
     def count(self, mission_type: int) -> int:
         # The firmware counts the items of a fence at the end of its boot, or when it stores a fence.
         is_counted = self._vehicle.is_initialised or self._was_fence_stored
-        return self._lists[mission_type].count if is_counted or mission_type != MavMissionType.FENCE else 0
+        is_uncounted_fence = mission_type == MavMissionType.FENCE and not is_counted
+        return 0 if is_uncounted_fence else self._lists[mission_type].count
 
     def _key(self, mission_type: int) -> int:
         return mission_type
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
         kind = message.mission_type
-        if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
+        needs_mavlink2 = kind in self._lists and kind != MavMissionType.MISSION
+        if needs_mavlink2 and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
         # During an upload, only MISSION_REQUEST is served, and even MISSION_REQUEST_INT is denied. The base class

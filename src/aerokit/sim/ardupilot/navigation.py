@@ -21,7 +21,7 @@ _WITH_POSITION = int(
     | Ekf.PRED_POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_ABS
 )  # fmt: skip
 _RELATIVE = int(_DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_REL)
-_EXTERNAL_NAVIGATION = 6
+_EXTERNAL_NAVIGATION = 6  # value of EK3_SRC1_POSXY
 _POSITION_TIMEOUT_S, _AIDING_TIMEOUT_S = 7.0, 15.0
 _CHECK_INTERVAL_S = 0.1
 
@@ -194,7 +194,9 @@ class ArduPilotNavigation:
     def _use_gps_when_possible(self) -> None:
         if self.flags == _WITH_POSITION:  # `_check_gps` has set the flags already.
             return
-        if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
+        has_fix = self.fix_type >= GpsFixType.TYPE_3D_FIX
+        can_use_gps = has_fix and self.origin is not None and not self.uses_external
+        if not can_use_gps:
             self._vehicle.call_later(1.0, self._use_gps_when_possible)
             return
         self.flags = _WITH_POSITION
@@ -208,7 +210,8 @@ class ArduPilotNavigation:
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._gps_lost_at = math.nan
             self.fix_type = GpsFixType.RTK_FIXED
-            if self.origin is not None and not self.has_position and not self.uses_external:
+            must_use_gps = not self.has_position and not self.uses_external
+            if must_use_gps and self.origin is not None:
                 self._use_gps_when_possible()
 
     def _follow_gps_loss(self) -> None:

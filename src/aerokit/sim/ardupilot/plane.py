@@ -166,7 +166,7 @@ class SimulatedPlane(PlaneHost):
         return MavResult.FAILED
 
     def _start_mission(self, command: ReceivedCommand) -> int:
-        if command.param1 or command.param2:
+        if command.param1 or command.param2:  # The firmware refuses a first and a last item.
             return MavResult.DENIED
         return self.change_to(PlaneMode.AUTO)
 
@@ -176,7 +176,8 @@ class SimulatedPlane(PlaneHost):
         point = self.world_point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return MavResult.DENIED
-        if self.mode is not self.guided and not to_int(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+        may_change_mode = bool(to_int(command.param2) & MavDoRepositionFlags.CHANGE_MODE)
+        if self.mode is not self.guided and not may_change_mode:
             return MavResult.FAILED
         if not self.set_mode(PlaneMode.GUIDED):
             return MavResult.FAILED

@@ -119,7 +119,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self.distance_to_destination < _ON_CIRCLE_SHARE * radius
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        if self.vehicle.mode is not self or not self.vehicle.is_armed or not self._is_done(index, item):
+        flies_mission = self.vehicle.mode is self and self.vehicle.is_armed
+        if not flies_mission or not self._is_done(index, item):
             return False
         if item.command <= Cmd.NAV_LAST:
             self.vehicle.send(m.MissionItemReached(index))
@@ -299,7 +300,8 @@ class PlaneGuided(PlaneNavigatingMode, GuidedMode):
 
     def on_local_target(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
         plane, target = self.vehicle, self.destination
-        if not self.is_active or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
+        is_supported = message.coordinate_frame == MavFrame.LOCAL_OFFSET_NED
+        if not self.is_active or not is_supported or target is None:
             return
         _north, _east, target_down = target
         _north, _east, home_down = plane.home_or_ground

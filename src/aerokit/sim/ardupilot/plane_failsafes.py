@@ -198,10 +198,11 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         is_landing = self.vehicle.mode.is_landing
         # The Q modes need lifting rotors. A plane without them executes all three actions as LAND.
         lands = action in (_LAND, _QLAND, _LOITER_QLAND)
+        returns = action in (_BATTERY_RTL, _AUTOLAND_OR_RTL)
         if action == _TERMINATE:
             self.refuse_termination()
-        elif not is_landing and (lands or action in (_BATTERY_RTL, _AUTOLAND_OR_RTL)):
-            if lands and self._land_by_mission():
+        elif not is_landing and (lands or returns):
+            if lands and self._land_by_mission():  # Without a landing sequence, the plane returns.
                 return
             preferred = (PlaneMode.AUTOLAND,) if action == _AUTOLAND_OR_RTL else ()
             self.vehicle.enter_first_accepted(*preferred, PlaneMode.RTL)
@@ -246,7 +247,8 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
 
     def update(self) -> None:
         super().update()
-        if not self.enabled and self.caused_mode and self._mode_before is not None:
+        is_disabled_in_return = self.caused_mode and not self.enabled
+        if is_disabled_in_return and self._mode_before is not None:
             if self.vehicle.mode.number == PlaneMode.GUIDED and self.action in _RETURNS:
                 self.vehicle.set_mode(self._mode_before)
             self.caused_mode = False

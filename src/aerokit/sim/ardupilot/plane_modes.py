@@ -71,7 +71,8 @@ class PlaneHost(ArduPilotVehicle):
 
 _FLARE_SINK_M_S = 0.5
 _APPROACH_SHARE = 0.85
-_JOINED_M = 60.0
+# An approach begins within this distance and this height difference from its start.
+_JOINED_M, _JOINED_HEIGHT_M = 60.0, 15.0
 _CORRECTION_LENGTH_M = 80.0
 
 
@@ -104,7 +105,7 @@ class PlaneLanding:
     def _fly_to_start(self, start: Ned) -> None:
         wing = self._plane.wing
         _, _, down = start
-        if wing.distance_to(start) < _JOINED_M and abs(wing.down - down) < _JOINED_M / 4:
+        if wing.distance_to(start) < _JOINED_M and abs(wing.down - down) < _JOINED_HEIGHT_M:
             self._approach_start = wing.place
             self._unreached_start = None
             return
@@ -153,7 +154,8 @@ class PlaneLanding:
         if math.isnan(self._stopped_at):
             self._stopped_at = plane.now
         delay = plane.parameters["LAND_DISARMDELAY"]
-        if plane.is_armed and delay > 0 and plane.now - self._stopped_at >= delay:
+        is_due = delay > 0 and plane.now - self._stopped_at >= delay
+        if is_due and plane.is_armed:
             plane.arming.disarm()
             plane.info("Auto disarmed")
             if not self._is_distance_reported:

@@ -78,7 +78,7 @@ class ArduPilotMessageRequests:
 
     def set_interval(self, command: ReceivedCommand) -> int:
         message_id, interval_us = to_int(command.param1), to_int(command.param2)
-        if command.param3 != 0.0:
+        if command.param3 != 0.0:  # The firmware supports only 0.
             return MavResult.DENIED
         if message_id not in self._supported:
             self._vehicle.info(f"No ap_message for mavlink id ({message_id})")

@@ -67,11 +67,9 @@ _MODES: dict[int, tuple[int, ...]] = {
 }
 _RADIO, _GCS = "Radio", "GCS"
 _RADIO_TIMEOUT_S = 0.5
-_CONTINUE_MISSION = 2
-_ACTIVE_IN_HOLD = 1
-_EKF_REPORT_ONLY = 2
+# Values of FS_THR_ENABLE and FS_GCS_ENABLE, of FS_OPTIONS (bit 0), FS_EKF_ACTION and FS_CRASH_CHECK.
+_CONTINUE_MISSION, _ACTIVE_IN_HOLD, _EKF_REPORT_ONLY, _HOLD_AND_DISARM = 2, 1, 2, 2
 _ESTIMATOR_TIMEOUT_S, _STUCK_TIMEOUT_S, _MAX_STUCK_SPEED_M_S = 1.0, 2.0, 0.08
-_HOLD_AND_DISARM = 2
 _DRIVES_ITSELF = frozenset(
     {RoverMode.AUTO, RoverMode.GUIDED, RoverMode.RTL, RoverMode.SMART_RTL, RoverMode.LOITER, RoverMode.CIRCLE}
 )
@@ -138,7 +136,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
         self._triggered &= self._lost  # A link that has returned can start the failsafe again.
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
-        if not self._lost or self._triggered or is_waiting or not self._may_act():
+        is_due = self._lost and not self._triggered and not is_waiting
+        if not is_due or not self._may_act():
             return
         # Like the firmware, name the link that was just checked, even if only the other link is lost (failsafe.cpp,
         # failsafe_trigger).

@@ -41,7 +41,7 @@ class SubArming(ArduPilotArming[SubHost]):
         parameters = self.vehicle.parameters
         prefixes = [f"BTN{number}_" for number in _BUTTONS if f"BTN{number}_FUNCTION" in parameters]
         functions = {int(parameters[f"{prefix}FUNCTION"]) for prefix in prefixes}
-        if not prefixes or functions & _DISARMS:
+        if not prefixes or functions & _DISARMS:  # A vehicle without parameters of buttons passes the check.
             return True
         return _SHIFT in functions and any(int(parameters[f"{prefix}SFUNCTION"]) in _DISARMS for prefix in prefixes)
 
@@ -49,7 +49,8 @@ class SubArming(ArduPilotArming[SubHost]):
 # Values of FS_GCS_ENABLE. The value 1 only warns.
 _FAILSAFE_DISARM, _HOLD, _SURFACE = 2, 3, 4
 _GCS_MODES = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
-_BATTERY_DISARM, _BATTERY_SURFACE = 2, 3
+_BATTERY_NONE, _BATTERY_WARN, _BATTERY_DISARM, _BATTERY_SURFACE = range(4)  # the battery actions
+# Values of FS_PILOT_INPUT, FS_LEAK_ENABLE and FS_THR_ENABLE.
 _PILOT_DISARM, _LEAK_SURFACE, _RADIO_SURFACE = 2, 2, 2
 _GCS_REPORT_INTERVAL_S, _LEAK_REPORT_INTERVAL_S, _HULL_REPORT_INTERVAL_S = 30.0, 20.0, 30.0
 _HULL_TIMEOUT_S = 2.0
@@ -60,7 +61,7 @@ _STICKS, _STICK_MIDDLE = 6, 1500
 class SubFailsafes(ArduPilotFailsafes[SubHost]):
     """ArduSub's failsafes, except those of terrain, estimator and crash. Most of them act only while armed."""
 
-    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, _BATTERY_WARN, _BATTERY_NONE)
 
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
@@ -135,8 +136,11 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         if self.is_ground_station_lost or not sub.is_armed:
             return
         self.is_ground_station_lost: bool = True
-        is_mode_refused = action in _GCS_MODES and not sub.set_mode(_GCS_MODES[action])
-        if action == _FAILSAFE_DISARM or is_mode_refused:
+        must_disarm = action == _FAILSAFE_DISARM
+        if action in _GCS_MODES:
+            is_entered = sub.set_mode(_GCS_MODES[action])
+            must_disarm = not is_entered
+        if must_disarm:
             sub.arming.disarm()
 
     def act_on_battery(self, action: int) -> None:

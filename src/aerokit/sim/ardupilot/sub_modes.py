@@ -81,7 +81,7 @@ class _Mode(ArduPilotMode):
         share = self.vehicle.stick(index)
         return 0.0 if abs(share) < _DEADZONE else share
 
-    def horizontal_velocity_from_sticks(self) -> tuple[float, float]:
+    def turn_and_read_velocity(self) -> tuple[float, float]:
         """Turn by the yaw stick. Return the velocity (north, east) in m/s that the other sticks command."""
         motion = self.vehicle.motion
         motion.turn(self.stick(RC_YAW) * _FULL_STICK_TURN_RAD_S)
@@ -104,9 +104,9 @@ class _Manual(_Mode):
     def update(self, dt: float) -> None:
         climb = self.climb()
         if climb == 0.0:
-            self.vehicle.motion.push(*self.horizontal_velocity_from_sticks())
+            self.vehicle.motion.push(*self.turn_and_read_velocity())
         else:
-            self.vehicle.motion.seek_velocity(*self.horizontal_velocity_from_sticks(), -climb)
+            self.vehicle.motion.seek_velocity(*self.turn_and_read_velocity(), -climb)
 
 
 class _AltHold(_Mode):
@@ -115,7 +115,7 @@ class _AltHold(_Mode):
     needs_position = False
 
     def update(self, dt: float) -> None:
-        self.vehicle.motion.seek_velocity(*self.horizontal_velocity_from_sticks(), -self.climb())
+        self.vehicle.motion.seek_velocity(*self.turn_and_read_velocity(), -self.climb())
 
 
 class _Surface(_AltHold):
@@ -128,7 +128,7 @@ class _Surface(_AltHold):
             self.vehicle.set_mode(SubMode.ALT_HOLD)
         else:
             climb = self.vehicle.parameters["WPNAV_SPEED_UP"] / 100.0
-            self.vehicle.motion.seek_velocity(*self.horizontal_velocity_from_sticks(), -climb)
+            self.vehicle.motion.seek_velocity(*self.turn_and_read_velocity(), -climb)
 
 
 class SubAuto(RoverSubAuto):

@@ -9,6 +9,7 @@ from typing import Any
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
+    AirspeedSensorFlags,
     CopterMode,
     GpsFixType,
     MavAutopilot,
@@ -280,7 +281,8 @@ def _angle_of_attack(plane: PlaneHost) -> m.AoaSsa:
 def _airspeed(plane: PlaneHost) -> m.Airspeed:
     speed = plane.motion.airspeed_m_s
     pressure_hpa = 0.5 * _AIR_DENSITY * speed * speed / 100.0
-    return m.Airspeed(id=0, airspeed=speed, temperature=_UNKNOWN_TEMPERATURE, raw_press=pressure_hpa, flags=2)
+    flags = AirspeedSensorFlags.USING
+    return m.Airspeed(id=0, airspeed=speed, temperature=_UNKNOWN_TEMPERATURE, raw_press=pressure_hpa, flags=flags)
 
 
 def _display_value(sub: SubHost) -> m.NamedValueFloat:
@@ -410,7 +412,7 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
         **_without(m.Wind.ID, m.TerrainReport.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
         m.ServoOutputRaw.ID: _rover_outputs,
         m.RcChannelsScaled.ID: lambda rover: m.RcChannelsScaled(rover.time_boot_ms, *(0,) * 9, rssi=_UNKNOWN_RSSI),
-        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
+        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(MavVtolState.UNDEFINED, MavLandedState.UNDEFINED),
     },
     "sub": {
         **_without(m.Wind.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
@@ -420,7 +422,7 @@ BUILDERS_OF_KIND: dict[Kind, Builders] = {
         m.ScaledPressure3.ID: lambda sub: m.ScaledPressure3(
             sub.time_boot_ms, press_abs=0.0, press_diff=0.0, temperature=3620, temperature_press_diff=0
         ),
-        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
+        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(MavVtolState.UNDEFINED, MavLandedState.UNDEFINED),
     },
 }
 """Functions that build messages, by firmware and message id. The firmware sends no other messages."""

@@ -112,6 +112,7 @@ def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
 
 
 def _pressure_hpa(vehicle: ArduPilotVehicle) -> float:
+    """Return the pressure of the standard atmosphere at the altitude of the vehicle."""
     altitude = vehicle.navigation.frame.origin.altitude_m - vehicle.motion.down
     return float(1013.25 * (1 - 2.25577e-5 * altitude) ** 5.25588)
 

@@ -133,7 +133,7 @@ class Px4Calibration:
 
 
 def _sensor_of(command: ReceivedCommand) -> str:
-    """Return the sensor to calibrate, or an empty string."""
+    """Return the sensor to calibrate, or an empty string. x, y and z are the params 5, 6 and 7 of the command."""
     requests = {
         "gyro": command.param1 == 1,
         "mag": command.param2 == 1,

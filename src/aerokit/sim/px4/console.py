@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 _SERIAL_BYTES, _LOGGING_BYTES = 70, 249
 _BLOCK_INTERVAL_S, _MAX_TRIES = 0.05, 50
 _DEFINITION_BLOCKS = 2
+# Magic bytes with the file version, and a start time of 0 (https://docs.px4.io/main/en/dev_log/ulog_file_format.html).
 _HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
 
 
@@ -106,7 +107,7 @@ class Px4LogStream:
         if self._client is None or stream != self._stream_number:
             return
         self._tries += 1
-        if self._tries > _MAX_TRIES and self._sends_definitions:
+        if self._tries > _MAX_TRIES and self._sends_definitions:  # No acknowledgement has arrived, so the stream ends.
             self._client = None
             return
         # Each block contains two text messages, and the first block begins with the header of the file.

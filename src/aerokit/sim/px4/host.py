@@ -249,7 +249,8 @@ class Px4Host(SimulatedAutopilot):
 
     def _detect_landing(self) -> None:
         is_lifting_off = self.is_armed and self.flight.lifts_off
-        if not self._has_touched_down() or is_lifting_off or self.arming.is_terminated:
+        can_land = self._has_touched_down() and not is_lifting_off and not self.arming.is_terminated
+        if not can_land:
             self._touchdown_at = math.nan
         elif math.isnan(self._touchdown_at):
             self._touchdown_at = self.now
@@ -261,7 +262,8 @@ class Px4Host(SimulatedAutopilot):
             self.mission.on_landed()
 
     def _auto_disarm(self) -> None:
-        if not self.is_armed or not self.is_landed or self.flight.lifts_off:
+        stays_on_ground = self.is_landed and not self.flight.lifts_off
+        if not self.is_armed or not stays_on_ground:
             return
         if self._has_flown:
             if 0 < self.parameters["COM_DISARM_LAND"] <= self.now - self._landed_at:

@@ -22,7 +22,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.px4.host import Px4Host
 
 _INITIAL_SEQUENCE = 65526
-_INFO_LEVELS = 102
+_INFO_LEVELS = 0x66  # MAV_SEVERITY INFO (6): four bits for logs and four bits for other programs
 # Numbers that PX4's events use for the reasons of arming and disarming.
 _OTHER_REASON = 0
 _ARMED_BY = {"external command": 4, "mission start": 5}

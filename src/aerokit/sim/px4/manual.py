@@ -47,7 +47,7 @@ class Px4Sticks:
         if control.target not in (0, self._px4.system_id):
             return
         values = (control.x, control.y, control.z, control.r)
-        if any(not -1000 <= value <= 1000 for value in values):
+        if any(not -1000 <= value <= 1000 for value in values):  # PX4 ignores a message with an axis out of range.
             return
         self._move(roll=control.y / 1000, pitch=control.x / 1000, yaw=control.r / 1000, throttle=control.z / 500 - 1.0)
 

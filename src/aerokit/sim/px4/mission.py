@@ -104,7 +104,7 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
 
 def distance_warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     first = next((item for item in items if item.command in _WITH_PLACE), None)
-    distance = 0.0 if first is None else math.dist(px4.place_of(first)[:2], px4.home[:2])
+    distance = 0.0 if first is None else math.dist(px4.place_of(first)[:2], px4.home[:2])  # north and east
     if distance < _MAX_FIRST_DISTANCE_M:
         return None
     return f"First waypoint far away from home: {int(distance)}m. Correct mission loaded?"
@@ -385,7 +385,8 @@ class Px4Mission:
         px4.call_later(0.0, self._hold)
 
     def _hold(self) -> None:
-        if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
+        is_flying = self._px4.is_armed and not self._px4.is_landed
+        if self.is_finished and is_flying and self._px4.mode == MISSION:
             self._px4.change_mode(HOLD)
 
     def _mark_reached(self) -> None:

@@ -104,7 +104,8 @@ class Px4MissionServer(MissionServer):
         return self.lists[MavMissionType.MISSION]
 
     def _store_if_changed(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
-        if mission_type not in self.lists or (items and opaque_id == self.opaque_id(mission_type)):
+        is_unchanged = bool(items) and opaque_id == self.opaque_id(mission_type)
+        if mission_type not in self.lists or is_unchanged:
             return
         self.store(mission_type, items)
         self._opaque_ids[mission_type] = opaque_id

@@ -259,7 +259,7 @@ def _servo_output(px4: Px4Vehicle) -> m.ServoOutputRaw:
 
 def _mission_current(px4: Px4Vehicle) -> m.MissionCurrent:
     mission, store = px4.mission, px4.missions
-    ids = (store.opaque_id(0), store.opaque_id(1), store.opaque_id(2))
+    ids = (store.opaque_id(0), store.opaque_id(1), store.opaque_id(2))  # of mission, fence and rally points
     total = mission.count or INVALID_INDEX
     return m.MissionCurrent(mission.current, total, mission.state, mission.mode, *ids)
 

@@ -167,7 +167,8 @@ class ClientFilter:
             self._framer = _framer()
         may_control = mode != "never" and not has_name_conflict
         for frame in frames:
-            if is_read_only(frame) or (may_control and self._lease.acquire(self._client, now)):
+            is_allowed = is_read_only(frame) or (may_control and self._lease.acquire(self._client, now))
+            if is_allowed:
                 accepted.append(frame.raw)
                 continue
             holder = self._lease.holder(now) if may_control else None
@@ -295,7 +296,8 @@ class FreshnessChecker:
             is_fresh = any(beacon.number == stamp.beacon for beacon in self._sent)
         else:
             is_fresh = False
-        self.late += not is_fresh
+        if not is_fresh:
+            self.late += 1
         return is_fresh
 
     def is_new(self, client: str, stamp: Stamp) -> bool:

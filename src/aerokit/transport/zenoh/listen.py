@@ -190,7 +190,8 @@ class ZenohListen(NetworkLink):
             return
         client.received_at = now
         stamp = Stamp.decode(attachment)
-        if not self._freshness.is_fresh(stamp, now) or stamp is None:  # Without a stamp, the datagram counts as late.
+        is_fresh = self._freshness.is_fresh(stamp, now)
+        if stamp is None or not is_fresh:  # Without a stamp, the datagram counts as late.
             self._send_notices(name, client.refuse_late(data, now), stamp)
             return
         # Do not tell the client that a duplicate or overtaken datagram was refused: the first copy or a newer datagram

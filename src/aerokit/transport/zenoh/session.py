@@ -253,8 +253,8 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
 
 
 def _reason(error: Exception) -> str:
-    # The text ends with the location in zenoh's source.
-    text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
+    description, _, _ = str(error).partition(" at /")  # The location in zenoh's source follows.
+    text = description.strip().rstrip("!.") or type(error).__name__
     if text.startswith(_CONNECT_FAILED):
         endpoints = ", ".join(_ENDPOINTS.findall(text)) or text
         return f"cannot connect to {endpoints} (is a router or peer running there, and is this its address?)"
