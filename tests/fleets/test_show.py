@@ -278,9 +278,9 @@ def test_show_file_round_trip(tmp_path: FilePath) -> None:
     assert show.duration_s == 1.5
     assert show.top_speed_m_s("a") == pytest.approx(2 / 3)
     assert list(show.renamed({"a": "north/1", 'b,"c': "north/2"}).tracks) == ["north/1", "north/2"]
-    with pytest.raises(InvalidArgument, match="no fleet member is given for these tracks: a"):
+    with pytest.raises(InvalidArgument, match="names has no fleet member for these tracks: a"):
         show.renamed({'b,"c': "x"})
-    with pytest.raises(InvalidArgument, match="two tracks are given the same fleet member: x, x"):
+    with pytest.raises(InvalidArgument, match="names has the same fleet member for two tracks: x, x"):
         show.renamed({"a": "x", 'b,"c': "x", "not in the show": "y"})
 
 

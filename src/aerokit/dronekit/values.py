@@ -44,7 +44,7 @@ class Attitude(_Value):
 class _Place(_Value):
     """Base class of the two kinds of locations with latitude and longitude."""
 
-    # DroneKit's locations have these attributes, which are always None, for old programs.
+    # These attributes are always None. Old programs may read them, because DroneKit's locations have them.
     local_frame: Any = None
     global_frame: Any = None
 

@@ -213,8 +213,9 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
         Args:
             rate: Hz of the requested data streams; None requests none.
-            heartbeat_timeout: seconds to wait for the first heartbeat; 0 or less means 30 s. Later, orders and waits
-                raise APIException after this many seconds without a heartbeat; 0 or less means never.
+            heartbeat_timeout: seconds to wait for the first heartbeat. In addition, calls raise APIException when no
+                heartbeat has arrived for this many seconds. With 0 or less, the first heartbeat is awaited for 30 s,
+                and calls do not raise for missing heartbeats.
 
         Raises:
             APIException: no vehicle was found in time; the text describes what was received instead.

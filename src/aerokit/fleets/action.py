@@ -498,9 +498,10 @@ class FleetContext:
         self.actions: dict[FleetAction, None] = {}  # those that have not ended, the newest last
         self.newest_moves: dict[str, FleetAction] = {}  # the newest action that moves each member
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
-        # The vehicles' items after this upload; None if they are unknown.
+        # By member name: the vehicle's items after the last upload; None if they are unknown.
         self.uploaded_items: dict[str, Sequence[MissionItem] | None] = {}
-        # The missions of the upload that began last; empty if an older upload may have replaced one of them.
+        # The missions of the newest upload. Empty if another upload, which began earlier, ended later and may have
+        # replaced one of them.
         self.newest_upload: Mapping[str, Mission] = {}
         self.is_closed: bool = False
 

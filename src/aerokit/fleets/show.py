@@ -68,10 +68,10 @@ class Show(Snapshot):
         """
         missing = [track_name for track_name in self.tracks if track_name not in names]
         if missing:
-            raise InvalidArgument(f"names: no fleet member is given for these tracks: {', '.join(missing)}")
+            raise InvalidArgument(f"names has no fleet member for these tracks: {', '.join(missing)}")
         members = [names[track_name] for track_name in self.tracks]
         if len(set(members)) < len(members):
-            raise InvalidArgument(f"names: two tracks are given the same fleet member: {', '.join(members)}")
+            raise InvalidArgument(f"names has the same fleet member for two tracks: {', '.join(members)}")
         return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
 
     @classmethod

@@ -64,7 +64,7 @@ class RunningEndpoint:
         self.is_open: bool = False
         self._owns_link = False  # True once this object has opened the link, and therefore must close it
         self._reports_bursts = False  # True if the link calls `burst_ended`
-        # True for a link with one remote end, e.g. a serial port, whose only key in `_ports` is None.
+        # True for a link with one remote end, e.g. a serial port. The only key in `_ports` is then None.
         self._has_single_peer = False
         self._burst: list[bytes] = []  # datagrams of `_burst_peer` that are not processed yet
         self._burst_peer: Peer = None

@@ -24,7 +24,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class SharedLink(Link):
-    """Link of a hub over an open connection of this program.
+    """Link that lets a hub use an open connection of this program.
 
     The hub gets all frames that the connection receives or sends. The connection stays open when this link is closed.
     """

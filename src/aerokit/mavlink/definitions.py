@@ -177,13 +177,12 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
         FileFormatError: a file is larger than 16 MB.
     """
     dialects: dict[str, DialectDefinition] = {}
-    # Files that are being read. They are not read again, because files may include each other.
-    pending: set[str] = set()
+    visited: set[str] = set()  # Files may include each other, so a file is added before its includes are read.
 
     def visit(file: Path) -> None:
-        if file.name in dialects or file.name in pending:
+        if file.name in visited:
             return
-        pending.add(file.name)
+        visited.add(file.name)
         dialect = read_xml(file)
         for include in dialect.includes:
             visit(_find_include(include, file, search))

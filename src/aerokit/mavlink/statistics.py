@@ -54,12 +54,12 @@ class SourceStatistics(SourceFields):
     )
 
     _repetitions: int  # number of repeated frames with consecutive sequence numbers, up to the last one
-    # If two senders use the same ids, their sequence numbers form two streams. `expected` belongs to the current one,
-    # the next four attributes to the other one. They are set when a second stream begins.
+    # If two senders use the same ids, their sequence numbers form two streams. `expected` is about the current stream.
+    # The next four attributes are about the other stream. They are set when a second stream begins.
     _other_count: int  # number of frames of the other stream
     _other_at: float  # time of its last frame
-    _skipped_over: int  # number of frames that count as lost between the two streams
-    _returns: int  # number of frames of the other stream that arrived while it was the longer one
+    _skipped_over: int  # number of frames that counted as lost because of the gap to the other stream
+    _returns: int  # number of frames of the other stream that arrived while it had more frames than the current one
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id: int = system_id

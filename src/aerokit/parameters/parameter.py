@@ -265,9 +265,9 @@ def settings_equal(left: SettingValue, right: SettingValue) -> bool:
 
 
 def setting_key(value: SettingValue) -> object:
-    """Return the same key for values that are equal according to :func:`settings_equal`.
+    """Return a key that is the same for values that are equal according to :func:`settings_equal`.
 
-    An int beyond ±2**24 may have another key than a float to which it is equal.
+    There is one exception: an int beyond ±2**24 and a float that are equal may have different keys.
     """
     if isinstance(value, (str, bytes)):
         return _encoded(value)

@@ -267,7 +267,7 @@ class NamedReads(NamedRequests[ValueT]):
 
 
 class RepeatedAnswers(Generic[ValueT]):
-    """Consecutive answers to a write that report the same value. Enough of them end the write."""
+    """Counts consecutive answers to a write with the same value. After enough of them, the write ends."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same

@@ -24,7 +24,8 @@ __all__ = ["ParameterList", "merge_update"]
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
     """Merge a PARAM_VALUE that is not part of a list into a known parameter.
 
-    Unless the vehicle encodes integers ``bytewise``, a known integer type and a known large integer are kept.
+    PARAM_VALUE is less exact for integers, unless the vehicle encodes them ``bytewise``. Then the known type is kept
+    if the reported one is a float, and the known value if it rounds to the same float as the reported one.
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:

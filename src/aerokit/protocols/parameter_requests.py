@@ -181,9 +181,9 @@ class ParameterWrites(ParameterRequests):
 
     - The requested value with the requested type: the write is complete.
     - No answer: the value is read.
-    - The old value: PARAM_SET is sent again, because it may have been lost. If the vehicle reports the old value eight
-      times in a row, and still after 1.5 s, it is the result. While the old value is unknown, every unexpected value
-      is treated like the old value.
+    - The old value: PARAM_SET is sent again, because it may have been lost. The old value becomes the
+      result if the vehicle has reported it eight times in a row, the last time later than 1.5 s after the first
+      PARAM_SET. While the old value is unknown, every unexpected value is treated like the old value.
     - Another value: the value is read again. PARAM_SET is not sent again, because it would undo the change if another
       station has set the value. A value reported twice in a row is the result.
 

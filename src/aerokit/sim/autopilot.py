@@ -165,7 +165,10 @@ class VehicleStorage:
         self.files: FileTree = FileTree()
 
     def limit_rates(self, link_bytes_per_s: float | None, *, parameters: float, files: float, logs: float) -> None:
-        """Limit each server to a share of the link's data rate. None does not limit them."""
+        """Limit the data rates of parameter lists, files and logs to these shares of ``link_bytes_per_s``.
+
+        If ``link_bytes_per_s`` is None, nothing is limited.
+        """
         if link_bytes_per_s is not None:
             self.parameters.list_rate_hz = parameters * link_bytes_per_s / _PARAM_VALUE_FRAME
             self.ftp.burst_interval_s = _FTP_FRAME / (files * link_bytes_per_s)

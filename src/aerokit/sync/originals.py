@@ -22,7 +22,7 @@ class Twin:
     Attributes:
         path: dotted path of the asynchronous class, with its module.
         base: the hand-written base class in ``blocks.py``.
-        inherits: a generated twin that it inherits from; its members are not generated again.
+        inherits: another generated twin, the base class of this one; inherited members are not generated again.
         only: generate only these members.
         without: do not generate these members.
         special: generate these dunder methods, too.

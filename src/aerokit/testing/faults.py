@@ -114,7 +114,9 @@ class FaultInjector:
     def _set(
         self, name: str, value: object, after_s: float, for_s: float | None = None, *, healthy_value: object = False
     ) -> None:
-        """Set an attribute of `Faults` after ``after_s``. Set it to ``healthy_value`` ``for_s`` later."""
+        """Set an attribute of `Faults` after ``after_s`` seconds, and to ``healthy_value`` ``for_s`` seconds
+        after that.
+        """
         faults = self.all
         end_s = None if for_s is None else after_s + _duration(for_s)
         self._schedule(partial(setattr, faults, name, value), after_s)

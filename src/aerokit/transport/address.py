@@ -76,8 +76,8 @@ class LinkAddress(Snapshot):
 def parse_address(text: str) -> LinkAddress:
     """Parse a connection string.
 
-    A bare ``host:port`` and ``udp:`` listen, as in DroneKit and pymavlink. In forms with a scheme, except
-    ``pty:``, percent-encoded characters of devices and paths are decoded.
+    ``host:port`` and ``udp:host:port`` are UDP links that listen, as in DroneKit and pymavlink. In
+    forms with a scheme, except ``pty:``, percent-encoded characters of devices and paths are decoded.
 
     Raises:
         InvalidArgument: the string is wrong; the text has the reason and the accepted forms.

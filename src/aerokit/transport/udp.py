@@ -153,7 +153,7 @@ class _UdpLink(BaseLink):
 
 
 class UdpListen(_UdpLink):
-    """``udpin:`` link: binds a port. Each sender becomes a peer, and gets the data that is written to all peers.
+    """``udpin:`` link: binds a port. Each sender becomes a peer. Data that is written without a peer goes to all peers.
 
     With port 0, the system chooses a port. `address` and `local_address` have this port once the link is open.
     ``peers`` are the IP addresses and networks to accept; None: all.

@@ -130,7 +130,7 @@ class Candidate:
         return self._hardware_requests > 0 and self._answers_since_request < MAX_ANSWERS_WITHOUT_HARDWARE
 
     def record_hardware(self, *, is_other: bool) -> None:
-        """Record whether the link's hardware id contradicts that of the vehicle."""
+        """Record whether the hardware id reported over this link differs from that of the vehicle."""
         if is_other:
             self._mark_as_other_vehicle()
             self.was_same_vehicle = False

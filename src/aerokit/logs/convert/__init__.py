@@ -134,7 +134,8 @@ def _writer_for(target: Path, table_format: str) -> Callable[[Path, LogReader], 
     key = target.suffix.lower() if target.suffix else table_format
     if key not in formats:
         raise InvalidArgument(
-            f"unknown format {key!r}: a file can be {', '.join(FORMATS)}, the tables of a folder {' or '.join(FOLDERS)}"
+            f"unknown format {key!r}: expected {', '.join(FORMATS)} for a file,"
+            f" or {' or '.join(FOLDERS)} for a folder of tables"
         )
     writer: Callable[[Path, LogReader], _Writer] = formats[key]
     return writer

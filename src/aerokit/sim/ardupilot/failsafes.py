@@ -245,7 +245,7 @@ class ArduPilotArming(Generic[HostT]):
 
     def gps_reasons(self) -> Sequence[str]:
         nav = self.vehicle.navigation
-        flies_without_gps = nav.uses_external and not nav.is_gps_detected
+        flies_without_gps = nav.uses_external_navigation and not nav.is_gps_detected
         if nav.fix_type < GpsFixType.TYPE_3D_FIX and not flies_without_gps:
             return ("GPS 1: Bad fix" if nav.is_gps_detected else "GPS 1: not healthy",)
         return () if nav.home is not None else ("AHRS: waiting for home",)

@@ -206,9 +206,10 @@ class ArduPilotFence(Generic[HostT]):
 
     def _enable_floor_if_above(self) -> None:
         enable, auto_enable = self._enabling_parameters
-        enables_floor = self.configured & _MIN_ALT and (enable or auto_enable > 1)
+        has_floor = bool(self.configured & _MIN_ALT)
+        enables_floor = enable != 0 or auto_enable > 1
         is_disabled_by_command = self._floor_enabled_by_command is False
-        if not enables_floor or is_disabled_by_command or self.active & _MIN_ALT:
+        if not has_floor or not enables_floor or is_disabled_by_command or self.active & _MIN_ALT:
             return
         floor = self._parameter("FENCE_ALT_MIN") + self.vehicle.parameters["FENCE_MARGIN"]
         if self.vehicle.altitude_m >= floor:

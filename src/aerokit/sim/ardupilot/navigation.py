@@ -123,7 +123,7 @@ class ArduPilotNavigation:
         return True
 
     @property
-    def uses_external(self) -> bool:
+    def uses_external_navigation(self) -> bool:
         return self._vehicle.parameters.get("EK3_SRC1_POSXY", 0.0) == _EXTERNAL_NAVIGATION
 
     def _check(self) -> None:
@@ -132,7 +132,7 @@ class ArduPilotNavigation:
             self._check_gps()
 
     def _check_external(self) -> None:
-        if not self.uses_external or not self.has_attitude:
+        if not self.uses_external_navigation or not self.has_attitude:
             return
         if self._external.navigation_age_s > _POSITION_TIMEOUT_S:
             self.flags = _ATTITUDE_ONLY
@@ -195,7 +195,7 @@ class ArduPilotNavigation:
         if self.flags == _WITH_POSITION:  # `_check_gps` has set the flags already.
             return
         has_fix = self.fix_type >= GpsFixType.TYPE_3D_FIX
-        can_use_gps = has_fix and self.origin is not None and not self.uses_external
+        can_use_gps = has_fix and self.origin is not None and not self.uses_external_navigation
         if not can_use_gps:
             self._vehicle.call_later(1.0, self._use_gps_when_possible)
             return
@@ -210,7 +210,7 @@ class ArduPilotNavigation:
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._gps_lost_at = math.nan
             self.fix_type = GpsFixType.RTK_FIXED
-            must_use_gps = not self.has_position and not self.uses_external
+            must_use_gps = not self.has_position and not self.uses_external_navigation
             if must_use_gps and self.origin is not None:
                 self._use_gps_when_possible()
 
@@ -220,7 +220,7 @@ class ArduPilotNavigation:
             self.fix_type = GpsFixType.NO_FIX
             return
         lost_for = self._vehicle.now - self._gps_lost_at
-        if self.uses_external:  # External navigation provides the position, even without GPS.
+        if self.uses_external_navigation:  # External navigation provides the position, even without GPS.
             return
         if self.has_position and lost_for >= _POSITION_TIMEOUT_S:
             # On the ground, the estimator still knows the velocity.

@@ -76,7 +76,7 @@ def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about an invalid order of DO_LAND_START, landing and return."""
+    """Return PX4's text if DO_LAND_START, landings and RETURN_TO_LAUNCH follow each other in an invalid sequence."""
     # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):

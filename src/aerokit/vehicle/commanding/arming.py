@@ -368,7 +368,7 @@ class ArmingActions(VehicleBase):
         return bool(armed.latest)
 
     def _mode_instead_of_flight(self) -> Mode | None:
-        """Return the mode to arm in if the present one would start a flight that the program has not ordered."""
+        """Return a safe mode to arm in if arming in the present mode would start an unordered flight; else None."""
         would_start_flight = self._is_in_unordered_flight_mode() and not self.telemetry.is_armed
         return self.autopilot.mode_to_arm_in() if would_start_flight else None
 

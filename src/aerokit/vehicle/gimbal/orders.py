@@ -114,7 +114,7 @@ class GimbalOrders:
         return f"gimbal {self.device.device_id}" if self.device.component_id else "the gimbal"
 
     async def send(self, order: Order | None, command: int, *params: float) -> None:
-        """Send a COMMAND_LONG to the manager, as a part of ``order``. None: the command belongs to no other order."""
+        """Send a COMMAND_LONG to the manager, as a part of ``order``; None if the command is an order of its own."""
         with self.context.arbiter.auxiliary_order(order) as sent_order:
             await self.context.sender.send_long(sent_order, command, *params, component_id=self.manager_id)
 
@@ -130,7 +130,9 @@ class GimbalOrders:
         except CommandRejected:
             self.raise_if_taken()
             was_claimed = self.claim_if_denied(command)
-            if not was_claimed:  # The refusal has another reason, or a `gimbal.control()` block claims control.
+            if (
+                not was_claimed
+            ):  # Claiming control does not help: control was not missing, or a `gimbal.control()` block claims it.
                 raise
             await send()
 

@@ -95,7 +95,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     async def __aenter__(self) -> Self:
         """Order the first rates by a command, which the manager acknowledges, and begin to send rates."""
         if self._was_entered:
-            raise BusyError("GimbalRates can be entered only once: call rates() again")
+            raise BusyError("GimbalRates can be entered only once: call rates() for a new one")
         self._was_entered = True
         orders = self._orders
         self._order = orders.begin_order()

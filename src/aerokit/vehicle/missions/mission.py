@@ -102,7 +102,7 @@ class MissionEndDetector:
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
         # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
-        # On the ground, the mission has ended only if the vehicle has landed instead of fallen.
+        # A vehicle that has crashed is on the ground, too, but its mission has not ended.
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
