@@ -130,9 +130,8 @@ class GimbalOrders:
         except CommandRejected:
             self.raise_if_taken()
             was_claimed = self.claim_if_denied(command)
-            if (
-                not was_claimed
-            ):  # Claiming control does not help: control was not missing, or a `gimbal.control()` block claims it.
+            # Nothing was claimed if control was not missing, or if a `gimbal.control()` block claims it.
+            if not was_claimed:
                 raise
             await send()
 
