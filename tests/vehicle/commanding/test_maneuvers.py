@@ -24,6 +24,7 @@ from aerokit.errors import (
     CommandTimeout,
     ConnectionClosed,
     InvalidArgument,
+    LinkLost,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -203,6 +204,18 @@ async def test_orbit_without_turns_ends_in_a_hold_when_cancelled() -> None:
             await vehicle.orbit(vehicle.position.value, radius_m=10, speed_m_s=4, turns=None)
         await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
         assert len(wire.commands(MavCmd.DO_ORBIT)) == 1
+
+
+@pytest.mark.parametrize("call", ["orbit", "go_to"])
+async def test_call_raises_error_of_ended_connection(call: str) -> None:
+    async with in_the_air() as flight:
+        place = flight.vehicle.position.value.offset(north_m=100)
+        arguments = {"radius_m": 10} if call == "orbit" else {}
+        task = asyncio.create_task(getattr(flight.vehicle, call)(place, **arguments))
+        await anyio.sleep(5.0)
+        flight.wire.lose()
+        with pytest.raises(LinkLost, match="cable"):
+            await task
 
 
 async def test_orbit_px4_radius_too_large_reports_its_reason() -> None:

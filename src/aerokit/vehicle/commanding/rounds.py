@@ -232,6 +232,7 @@ class RoundFlight:
                     setpoints = await self._path_setpoints(path, speed_m_s, facing)
                 await self._stream_to_end(setpoints, order)
         except SetpointStreamStopped as error:
+            self._session.end.raise_if_ended()  # After the end, `is_silent` is true whatever stopped the stream.
             error_class = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
             raise error_class(f"{self._operation}: {error}") from error
         if scope.cancelled_caught:
