@@ -52,6 +52,26 @@ def test_other_stream_takes_over_after_timeout(source: SourceStatistics, after_s
     assert verdicts_of(source, [(1.0, 100), (1.0 + after_s, 101)]) == [OTHER_SENDER, verdict]
 
 
+def test_loss_where_an_outage_began_256_frames_ago_shows_no_second_sender() -> None:
+    """Sequence numbers wrap, so the stream comes by the number at which it was interrupted."""
+    source = SourceStatistics(1, 1, 0)
+    verdicts_of(source, [*numbers(0, 50), *numbers(70, 306, 0.7)])
+    assert verdicts_of(source, numbers(307, 340, 3.1)) == [IN_ORDER] * 33
+    assert source.lost == 20 + 1
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.1, 0.3])
+@pytest.mark.parametrize("rate_hz", [50, 100, 200])
+def test_lossy_link_with_outages_has_one_sender(loss: float, rate_hz: int) -> None:
+    chance, source = random.Random(repr((loss, rate_hz))), SourceStatistics(1, 1, 0)
+    for number in range(100 * rate_hz):
+        now = number / rate_hz
+        is_outage = now % 10 > 9.5
+        if not is_outage and chance.random() >= loss:
+            assert verdicts_of(source, [(now, number & 0xFF)]) == [IN_ORDER]
+    assert not source.has_duplicates(100.0)
+
+
 class _Sender:
     def __init__(self, chance: random.Random) -> None:
         self._chance, self.number = chance, chance.randrange(256)
@@ -87,30 +107,30 @@ def random_summary(seed: int) -> str:
 @pytest.mark.parametrize(
     ("seed", "summary"),
     [
-        (0, "415 341 153 909 427 75"),
-        (1, "495 79 430 1004 15 203"),
+        (0, "415 340 154 909 427 75"),
+        (1, "520 105 379 1004 21 193"),
         (2, "1061 62 0 1123 124 0"),
         (3, "493 92 341 926 146 205"),
-        (4, "593 122 357 1072 0 190"),
-        (5, "481 137 312 930 197 209"),
+        (4, "600 155 317 1072 2 181"),
+        (5, "520 128 282 930 330 169"),
         (6, "992 56 0 1048 76 0"),
-        (7, "617 134 303 1054 20 171"),
+        (7, "606 182 266 1054 14 153"),
         (8, "530 106 425 1061 30 168"),
-        (9, "448 360 208 1016 692 90"),
+        (9, "449 359 208 1016 694 90"),
         (10, "1025 40 0 1065 73 0"),
-        (11, "421 255 155 831 1486 84"),
-        (12, "505 221 215 941 447 91"),
-        (13, "385 61 234 680 164 236"),
+        (11, "412 266 153 831 1477 82"),
+        (12, "538 249 154 941 624 78"),
+        (13, "430 78 172 680 170 188"),
         (14, "977 59 0 1036 54 0"),
-        (15, "520 110 287 917 38 179"),
-        (16, "542 67 350 959 24 248"),
-        (17, "612 257 161 1030 902 66"),
+        (15, "494 97 326 917 64 188"),
+        (16, "531 124 304 959 25 192"),
+        (17, "599 326 105 1030 915 44"),
         (18, "541 94 279 914 66 206"),
-        (19, "710 37 14 761 293 14"),
-        (20, "494 104 273 871 309 182"),
-        (21, "422 83 287 792 167 152"),
-        (22, "639 76 388 1103 147 293"),
-        (23, "575 85 405 1065 48 285"),
+        (19, "719 42 0 761 295 0"),
+        (20, "488 107 276 871 312 182"),
+        (21, "435 88 269 792 179 165"),
+        (22, "613 92 398 1103 139 220"),
+        (23, "561 104 400 1065 93 279"),
     ],
 )
 def test_random_traffic_statistics_are_unchanged(seed: int, summary: str) -> None:

@@ -106,8 +106,11 @@ class SourceStatistics(SourceFields):
         if self.expected != self._last_expected:
             self._last_expected, self._advanced_at = self.expected, now
         ahead = (sequence - self.expected) & 0xFF
-        continues_other = self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP
-        if continues_other:
+        # After 256 frames, the current stream comes by the place where the other one has stopped. A frame that follows
+        # the current stream after a small gap belongs to it.
+        follows_current = ahead <= _MAX_GAP
+        is_near_other = self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP
+        if is_near_other and not follows_current:
             if now - self._other_at < _EXPIRY_S:
                 return self._continue_other(sequence, now)
             self._other_expected = -1
