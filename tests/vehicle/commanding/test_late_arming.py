@@ -324,6 +324,34 @@ async def test_cancelled_arm_leaves_vehicle_to_newer_arm(grounded: Flight) -> No
     assert grounded.copter.is_armed
 
 
+@pytest.mark.parametrize("is_newer_sent", [True, False])
+async def test_cancelled_arm_leaves_vehicle_to_older_arm(grounded: Flight, is_newer_sent: bool) -> None:
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    await grounded.vehicle.set_mode("GUIDED")
+    if not is_newer_sent:  # The command of the newer call waits until that of the older call is answered.
+        grounded.copter.faults.lose_ack(ARM)
+    older = asyncio.create_task(grounded.vehicle.arm())
+    await anyio.sleep(0.01)
+    with anyio.move_on_after(0.01):
+        await grounded.vehicle.arm()
+    await older
+    await anyio.sleep(ARM_WATCH_S)
+    assert ordered(grounded) == ([1, 1] if is_newer_sent else [1])
+    assert grounded.copter.is_armed
+
+
+async def test_two_cancelled_arms_are_undone(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    older = asyncio.create_task(grounded.vehicle.arm())
+    await anyio.sleep(0.01)
+    with anyio.move_on_after(0.01):
+        await grounded.vehicle.arm()
+    older.cancel()
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1, 1, 0]
+    assert not grounded.copter.is_armed
+
+
 async def test_abandoned_arming_before_newer_mode_is_undone(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.lose_ack(ARM)

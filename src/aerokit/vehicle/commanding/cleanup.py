@@ -335,18 +335,22 @@ class ArmCleanup:
         self._task = BackgroundTask(
             session, "aerokit late arming", warning_clause="while an arm command may still be executed"
         )
-        # The arm order whose effect a call waits for, and whether the vehicle was armed before it.
-        self._awaited: tuple[Order, bool] | None = None
+        # The arm orders whose effects calls wait for, and whether the vehicle was armed before them.
+        self._awaited: list[tuple[Order, bool]] = []
 
     @contextmanager
     def arming(self, order: Order, was_armed: bool) -> Iterator[None]:
         """Register an arm order while a call awaits it, so that `finish` can watch it."""
-        self._awaited = order, was_armed
+        self._awaited.append((order, was_armed))
         try:
             yield
+            for other in self._other_awaited(order):  # If such a call is abandoned, the vehicle must stay armed.
+                other.arm_command_number = None
         finally:
-            if self._awaited == (order, was_armed):
-                self._awaited = None
+            self._awaited = [awaited for awaited in self._awaited if awaited[0] is not order]
+
+    def _other_awaited(self, order: Order) -> list[Order]:
+        return [other for other, _ in self._awaited if other is not order]
 
     def late_arming_hint(self) -> str:
         unsent = self._session.connection.unsent_bytes
@@ -359,9 +363,13 @@ class ArmCleanup:
     def watch(self, order: Order, was_armed: bool) -> bool:
         """Watch in the background whether the abandoned arm command still arms the vehicle.
 
-        Returns False if the program has given a newer arm or disarm command, which counts instead.
+        Returns False if the program has given a newer arm or disarm command, which counts instead, or if another call
+        still waits for an arm command, or has armed the vehicle meanwhile.
         """
         if not self._is_newest_arm_command(order):
+            return False
+        if other_orders := self._other_awaited(order):  # If that call is abandoned too, it watches the vehicle.
+            other_orders[-1].arm_command_number = order.arm_command_number
             return False
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
         mode = self._session.telemetry.mode.latest
@@ -460,6 +468,7 @@ class ArmCleanup:
 
     async def finish(self) -> None:
         """Wait briefly for the outcome of an abandoned arm order. Logs a warning if it stays unknown."""
-        if self._awaited is not None:  # A task still waits for an arm order, which is now abandoned.
-            self.watch(*self._awaited)
+        awaited, self._awaited = self._awaited, []
+        if awaited:  # Tasks still wait for arm orders, which are now abandoned.
+            self.watch(*awaited[-1])
         await self._task.finish(ARM_CLOSE_TIMEOUT_S)
