@@ -226,6 +226,21 @@ def test_abandoned_mode_within_three_seconds_is_no_takeover(after_s: float, end:
     assert order.end == end
 
 
+@pytest.mark.parametrize("reported_after_s", [MODE_GRACE_S - 0.1, MODE_GRACE_S])
+def test_abandoned_mode_after_report_that_settles_it_is_takeover(reported_after_s: float) -> None:
+    """The abandoned order was never confirmed, e.g. because a pilot took over."""
+    stage = Stage()
+    stage.arbiter.order(GUIDED, BRAKE)
+    stage.arbiter.doubt_mode()
+    stage.report(LOITER, after=reported_after_s)
+    is_settled = reported_after_s >= MODE_GRACE_S
+    assert stage.arbiter.mode_is_in_doubt is not is_settled
+    stage.now += MODE_GRACE_S
+    order = stage.arbiter.order(RTL)
+    stage.report(GUIDED)
+    assert order.end == ("the mode changed to GUIDED" if is_settled else "")
+
+
 @pytest.mark.parametrize(("after_s", "end"), [(2.9, ""), (3.0, "the mode changed to RTL")])
 def test_raw_order_accepts_any_mode_for_three_seconds(after_s: float, end: str) -> None:
     stage = Stage()

@@ -402,9 +402,14 @@ class CommandArbiter:
 
     @property
     def mode_is_in_doubt(self) -> bool:
-        """True while the result of a mode change is unknown."""
-        is_in_doubt = self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
-        return is_in_doubt or bool(self.late_modes())
+        """True while the result of a mode change is unknown.
+
+        A report from `mode_settles_at` or later shows the result, so that another party's change of the mode that
+        follows is not taken for it.
+        """
+        is_settled = self._telemetry.mode.updated_at >= self.mode_settles_at
+        is_doubted = self._doubted_change > self._confirmed_change and not is_settled
+        return self._open_mode_changes > 0 or is_doubted or bool(self.late_modes())
 
     def settle_mode(self) -> None:
         """Record that the vehicle reports the mode that was ordered last."""
