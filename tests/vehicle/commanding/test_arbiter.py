@@ -189,6 +189,20 @@ def test_accepted_mode_before_heartbeat_is_no_takeover(refused: bool, end: str) 
     assert (order.end, order.may_move) == (end, not refused)
 
 
+@pytest.mark.parametrize(("after_s", "may_move"), [(MODE_GRACE_S - 0.1, True), (MODE_GRACE_S, False)])
+def test_replacement_of_order_that_was_just_sent_may_move(after_s: float, may_move: bool) -> None:
+    stage = Stage()
+    first = stage.arbiter.order(GUIDED)
+    first.may_move = True
+    stage.now += 10.0
+    with suppress(CommandTimeout), stage.arbiter.sending(first, modes=(GUIDED,)):
+        assert stage.arbiter.order(RTL).may_move
+        stage.arbiter.newest = first
+        raise CommandTimeout("no answer")
+    stage.now += after_s
+    assert stage.arbiter.order(RTL).may_move is may_move
+
+
 def test_late_modes_of_several_replaced_orders_are_no_takeover() -> None:
     stage = Stage()
     for mode in (GUIDED, RTL):

@@ -177,7 +177,7 @@ class CommandArbiter:
         ends_flight = ends_flight or self._all_end_flight(modes)
         order = self._new_order_expecting_late_modes(modes, (STEERING,), ends_flight=ends_flight)
         order.was_flown_before = was_flown
-        # If this order replaces an order in progress, the vehicle may already be moving.
+        # If this order replaces an order in progress, the vehicle may already be moving, or may do so soon.
         order.may_move = self._is_executing_newest()
         self._set_latest(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
@@ -336,6 +336,7 @@ class CommandArbiter:
             raise
         finally:
             self._sent_commands.remove(sent)
+            order.command_ended_at = self._now()
 
     def record_own_arming(self, armed: bool) -> None:
         """Record that an arm or disarm command was sent without waiting for the acknowledgement."""
@@ -508,14 +509,17 @@ class CommandArbiter:
         return tuple(mode for at, mode in self._unreported_modes if at > since)
 
     def _is_executing_newest(self) -> bool:
+        """Return True if the vehicle executes the newest order, or is about to: HEARTBEAT may report its mode late."""
         order, mode = self.newest, self._telemetry.mode.latest
-        return (
-            order is not None
-            and mode is not None
-            and order.may_cause(mode)
-            and not order.takeover_reason
-            and not order.failsafe
-        )
+        if order is None or order.takeover_reason or order.failsafe:
+            return False
+        is_mode_reported = mode is not None and order.may_cause(mode)
+        return is_mode_reported or (order.may_move and order.is_effect_due and self._was_just_sent(order))
+
+    def _was_just_sent(self, order: Order) -> bool:
+        """Return True if a command of the order awaits its answer, or did so in the last three seconds."""
+        is_awaiting_answer = any(sent.order is order for sent in self._sent_commands)
+        return is_awaiting_answer or self._now() - order.command_ended_at < MODE_GRACE_S
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
         receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent_commands)
