@@ -75,6 +75,8 @@ class CommandArbiter:
         """True if the newest of these commands arms, False if it disarms; None before the first one."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
+        self.mode_changed_at: float = -math.inf
+        """Time at which the vehicle first reported its present mode."""
         # Until this time, any reported mode may be the effect of a raw command.
         self._any_mode_until = -math.inf
         self._arming_accepted_at = -math.inf
@@ -521,7 +523,9 @@ class CommandArbiter:
         is_awaiting_answer = any(sent.order is order for sent in self._sent_commands)
         return is_awaiting_answer or self._now() - order.command_ended_at < MODE_GRACE_S
 
-    def _on_mode(self, _: Mode | None, mode: Mode) -> None:
+    def _on_mode(self, mode_before: Mode | None, mode: Mode) -> None:
+        if mode != mode_before:
+            self.mode_changed_at = self._telemetry.mode.updated_at
         receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent_commands)
         for receiver in receivers:
             receiver.on_mode(mode, self._telemetry.mode.updated_at)
