@@ -189,6 +189,20 @@ def test_accepted_mode_before_heartbeat_is_no_takeover(refused: bool, end: str) 
     assert (order.end, order.may_move) == (end, not refused)
 
 
+@pytest.mark.parametrize(("after_s", "may_move"), [(MODE_GRACE_S - 0.1, True), (MODE_GRACE_S, False)])
+def test_replacement_of_order_that_was_just_sent_may_move(after_s: float, may_move: bool) -> None:
+    stage = Stage()
+    first = stage.arbiter.order(GUIDED)
+    first.may_move = True
+    stage.now += 10.0
+    with suppress(CommandTimeout), stage.arbiter.sending(first, modes=(GUIDED,)):
+        assert stage.arbiter.order(RTL).may_move
+        stage.arbiter.newest = first
+        raise CommandTimeout("no answer")
+    stage.now += after_s
+    assert stage.arbiter.order(RTL).may_move is may_move
+
+
 def test_late_modes_of_several_replaced_orders_are_no_takeover() -> None:
     stage = Stage()
     for mode in (GUIDED, RTL):
@@ -224,6 +238,21 @@ def test_abandoned_mode_within_three_seconds_is_no_takeover(after_s: float, end:
     order = stage.arbiter.order(BRAKE)
     stage.report(GUIDED)
     assert order.end == end
+
+
+@pytest.mark.parametrize("reported_after_s", [MODE_GRACE_S - 0.1, MODE_GRACE_S])
+def test_abandoned_mode_after_report_that_settles_it_is_takeover(reported_after_s: float) -> None:
+    """The abandoned order was never confirmed, e.g. because a pilot took over."""
+    stage = Stage()
+    stage.arbiter.order(GUIDED, BRAKE)
+    stage.arbiter.doubt_mode()
+    stage.report(LOITER, after=reported_after_s)
+    is_settled = reported_after_s >= MODE_GRACE_S
+    assert stage.arbiter.mode_is_in_doubt is not is_settled
+    stage.now += MODE_GRACE_S
+    order = stage.arbiter.order(RTL)
+    stage.report(GUIDED)
+    assert order.end == ("the mode changed to GUIDED" if is_settled else "")
 
 
 @pytest.mark.parametrize(("after_s", "end"), [(2.9, ""), (3.0, "the mode changed to RTL")])

@@ -253,3 +253,20 @@ async def test_raw_command_awaits_late_acknowledgement_despite_newer_action() ->
 
         tasks.start_soon(set_mode)
         await vehicle.command(MavCmd.DO_SET_RELAY, 0, 1)
+
+
+async def test_cancelled_replacement_of_flight_that_is_about_to_begin_holds() -> None:
+    """The vehicle obeys the first order, but has not reported its mode yet. The second order has sent nothing."""
+    async with _copter(flies=True) as (copter, vehicle, path):
+        await vehicle.hold()
+        await anyio.sleep(1.3)
+        _prepare(path, Disturbances(latency_s=0.3))
+        first = asyncio.create_task(_ended(vehicle.go_to(vehicle.position.value.offset(north_m=300))))
+        await anyio.sleep(0.1)
+        with anyio.move_on_after(0.1):
+            async with vehicle.follow(lambda: None):
+                raise AssertionError("entered without a target")
+        assert vehicle.mode_name == "BRAKE"  # the report from before the first order
+        await first
+        await anyio.sleep(5.0)
+        assert copter.mode.number == CopterMode.BRAKE

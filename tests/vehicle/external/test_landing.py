@@ -8,7 +8,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Flight, open_flight, open_px4
+from flight_harness import Flight, now, open_flight, open_px4
 
 from aerokit import messages as m
 from aerokit.errors import (
@@ -231,9 +231,26 @@ async def test_pilot_before_first_sight_keeps_vehicle() -> None:
         assert not flight.wire.mode_orders()
 
 
-async def take_over_after(flight: Flight, seconds: float) -> None:
+@pytest.mark.parametrize("after_s", [0.0, 5.0])
+async def test_pilot_who_chooses_mode_of_abandoned_flight_before_first_sight_keeps_vehicle(after_s: float) -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        await flight.take_off()
+        with anyio.move_on_after(2.0):
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+        await anyio.sleep(after_s)
+        begun = now()
+        see = camera(simulated.motion, blind=lambda: now() < begun + 7.0)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(take_over_after, flight, 5.0, CopterMode.GUIDED)
+            with pytest.raises(OperationRejected, match="to GUIDED; the order was not sent"):
+                await flight.vehicle.land_on(see)
+        assert CopterMode.LAND not in flight.wire.mode_orders()
+
+
+async def take_over_after(flight: Flight, seconds: float, mode: int = CopterMode.LOITER) -> None:
     await anyio.sleep(seconds)
-    flight.pilot_takes_over(CopterMode.LOITER)
+    flight.pilot_takes_over(mode)
 
 
 async def test_cancelled_precision_landing_continues_without_targets() -> None:

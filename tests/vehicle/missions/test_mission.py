@@ -822,3 +822,18 @@ async def test_item_number_is_unchecked_while_count_unknown() -> None:
             await mission.set_current(65535)
         with pytest.raises(CommandRejected):
             await mission.set_current(65534)
+
+
+@pytest.mark.parametrize(("mode", "end"), [("AUTO", "BRAKE"), ("LOITER", "LOITER")])
+async def test_cancelled_start_holds_only_vehicle_that_flies_its_mission(mode: str, end: str) -> None:
+    """Another station flies the vehicle. In AUTO, the vehicle proceeds to the item before it gets MISSION_START."""
+    async with open_flight(latency_s=0.2) as flight:
+        await flight.take_off()
+        await flight.vehicle.mission.upload(long_mission(40))
+        flight.pilot_takes_over(CopterMode[mode])
+        await anyio.sleep(2.0)
+        with anyio.move_on_after(0.1) as scope:
+            await flight.vehicle.mission.start(1)
+        assert scope.cancelled_caught
+        await anyio.sleep(4.0)
+        assert flight.vehicle.mode_name == end

@@ -75,6 +75,8 @@ class CommandArbiter:
         """True if the newest of these commands arms, False if it disarms; None before the first one."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
+        self.mode_changed_at: float = -math.inf
+        """Time at which the vehicle first reported its present mode."""
         # Until this time, any reported mode may be the effect of a raw command.
         self._any_mode_until = -math.inf
         self._arming_accepted_at = -math.inf
@@ -177,7 +179,7 @@ class CommandArbiter:
         ends_flight = ends_flight or self._all_end_flight(modes)
         order = self._new_order_expecting_late_modes(modes, (STEERING,), ends_flight=ends_flight)
         order.was_flown_before = was_flown
-        # If this order replaces an order in progress, the vehicle may already be moving.
+        # If this order replaces an order in progress, the vehicle may already be moving, or may do so soon.
         order.may_move = self._is_executing_newest()
         self._set_latest(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
@@ -336,6 +338,7 @@ class CommandArbiter:
             raise
         finally:
             self._sent_commands.remove(sent)
+            order.command_ended_at = self._now()
 
     def record_own_arming(self, armed: bool) -> None:
         """Record that an arm or disarm command was sent without waiting for the acknowledgement."""
@@ -402,9 +405,14 @@ class CommandArbiter:
 
     @property
     def mode_is_in_doubt(self) -> bool:
-        """True while the result of a mode change is unknown."""
-        is_in_doubt = self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
-        return is_in_doubt or bool(self.late_modes())
+        """True while the result of a mode change is unknown.
+
+        A report from `mode_settles_at` or later shows the result, so that another party's change of the mode that
+        follows is not taken for it.
+        """
+        is_settled = self._telemetry.mode.updated_at >= self.mode_settles_at
+        is_doubted = self._doubted_change > self._confirmed_change and not is_settled
+        return self._open_mode_changes > 0 or is_doubted or bool(self.late_modes())
 
     def settle_mode(self) -> None:
         """Record that the vehicle reports the mode that was ordered last."""
@@ -503,12 +511,21 @@ class CommandArbiter:
         return tuple(mode for added_at, mode in self._unreported_modes if added_at > since)
 
     def _is_executing_newest(self) -> bool:
+        """Return True if the vehicle executes the newest order, or is about to: HEARTBEAT may report its mode late."""
         order, mode = self.newest, self._telemetry.mode.latest
-        if order is None or mode is None or not order.may_cause(mode):
+        if order is None or order.takeover_reason or order.failsafe:
             return False
-        return not order.takeover_reason and not order.failsafe
+        is_mode_reported = mode is not None and order.may_cause(mode)
+        return is_mode_reported or (order.may_move and order.is_effect_due and self._was_just_sent(order))
 
-    def _on_mode(self, _: Mode | None, mode: Mode) -> None:
+    def _was_just_sent(self, order: Order) -> bool:
+        """Return True if a command of the order awaits its answer, or did so in the last three seconds."""
+        is_awaiting_answer = any(sent.order is order for sent in self._sent_commands)
+        return is_awaiting_answer or self._now() - order.command_ended_at < MODE_GRACE_S
+
+    def _on_mode(self, mode_before: Mode | None, mode: Mode) -> None:
+        if mode != mode_before:
+            self.mode_changed_at = self._telemetry.mode.updated_at
         receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent_commands)
         for receiver in receivers:
             receiver.on_mode(mode, self._telemetry.mode.updated_at)

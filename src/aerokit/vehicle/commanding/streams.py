@@ -20,7 +20,7 @@ from aerokit.errors import (
     SetpointStreamStopped,
 )
 from aerokit.parameters import Parameter
-from aerokit.vehicle.commanding.arbiter import STEERING
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, STEERING
 from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
@@ -358,7 +358,9 @@ class TakeoverCheck:
         self._order_before = context.arbiter.latest(STEERING)
         # True if the vehicle may still change to a mode of `_order_before`, such as the hold after an abandoned flight.
         was_taken_over = self._order_before is not None and bool(self._order_before.takeover_reason)
-        self._may_change_late = context.arbiter.mode_is_in_doubt and not was_taken_over
+        may_change_late = context.arbiter.mode_is_in_doubt and not was_taken_over
+        self._began_at = now = context.session.connection.now()
+        self._late_until = max(now + MODE_GRACE_S, context.arbiter.mode_settles_at) if may_change_late else -math.inf
         # The mode change (before, after) by which a take-off ends.
         self._end_of_take_off = (
             autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol),
@@ -370,15 +372,17 @@ class TakeoverCheck:
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} meanwhile; this order was not sent")
         mode_before, mode = self._mode_before, self._telemetry.mode.latest
-        is_unchanged = mode_before is None or mode == mode_before
+        changed_at = self._arbiter.mode_changed_at
+        is_unchanged = mode_before is None or (mode == mode_before and changed_at <= self._began_at)
         # The end of a take-off, and a change to the mode that the caller wants to order, are not takeovers.
         is_end_of_take_off = (mode_before, mode) == self._end_of_take_off
         order = self._order_before
         is_mode_of_order = order is not None and mode is not None and order.may_cause(mode)
-        is_late_effect = self._may_change_late and is_mode_of_order
+        is_late_effect = is_mode_of_order and changed_at < self._late_until
         if is_unchanged or mode == self._next_mode or is_end_of_take_off or is_late_effect:
             return
-        raise OperationRejected(f"{operation}: the mode changed from {mode_before} to {mode}; the order was not sent")
+        change = f"from {mode_before} to {mode}" if mode != mode_before else f"and back to {mode}"
+        raise OperationRejected(f"{operation}: the mode changed {change}; the order was not sent")
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:

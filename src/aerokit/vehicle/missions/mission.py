@@ -464,6 +464,7 @@ class MissionControl(VehiclePlan["Mission"]):
         if session.autopilot.sets_current_by_command:
             # With 0, which is home, ArduPilot begins with the first item and also resets its jump counts.
             number = 0 if item == 0 and not keeps_jump_counts else seq
+            self._expect_motion(order)
             try:
                 await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)
             except CommandRejected as error:
@@ -499,6 +500,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             self._vehicle_context.sender.raise_if_ended(sent.order)
             await self._vehicle_context.sender.await_recent_state(sent.order)
+            self._expect_motion(sent.order)
             await transfers.run(
                 SetCurrentItem(
                     transfers.system_id,
@@ -512,6 +514,10 @@ class MissionControl(VehiclePlan["Mission"]):
             )
         finally:
             self._context.lock.release()
+
+    def _expect_motion(self, order: Order) -> None:
+        # A vehicle that flies its mission proceeds to the new current item at once.
+        order.may_move = order.may_move or self._context.is_flying_mission
 
     @property
     def _current_seq(self) -> int | None:
