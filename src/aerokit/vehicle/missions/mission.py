@@ -87,10 +87,14 @@ class MissionEndDetector:
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         self._circle = CircleDetector(session)
         # Modes in which the vehicle may land. If the last item is a landing or a return, only the mode of this item.
+        autopilot, is_vtol = session.autopilot, session.telemetry.is_vtol
+        self._return_modes = autopilot.return_modes(is_vtol=is_vtol)
+        modes_of_purpose = {"return": self._return_modes, "land": (autopilot.mode_for("land", is_vtol=is_vtol),)}
         self._landing_modes = [
-            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
+            mode
             for command, purpose in LANDING_PURPOSES.items()
             if command == last_command or self._ending in (Ending.UNKNOWN, Ending.OTHER)
+            for mode in modes_of_purpose[purpose]
         ]
         # Until this time, HEARTBEAT may still report the mode before the mission.
         self._mode_grace_until = session.connection.now() + MODE_GRACE_S
@@ -110,10 +114,14 @@ class MissionEndDetector:
         if self._tracker.is_present_plan_complete:
             return self._is_completion_final()
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
-        if self._ending is Ending.RETURN and self._is_landing:
-            return self._is_on_ground or self._has_returned()
+        is_returning = self._ending is Ending.RETURN and self._is_landing
+        if is_returning or self._has_disarmed_after_return:
+            has_returned, mode = self._has_returned(), self._session.telemetry.mode.latest
+            lands_at_home = mode is not None and self._session.autopilot.lands_at_home(mode)
+            return self._is_on_ground or (has_returned and not lands_at_home)
         # The mission is not complete. The vehicle may fly it once more, so earlier observations do not count.
-        self._return_began_at = None
+        if not self._is_in_landing_mode:
+            self._return_began_at = None
         self._completed_at = None
         if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
             return True
@@ -121,6 +129,12 @@ class MissionEndDetector:
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
         # A vehicle that does not report the state of its mission has ended it when it reaches the last item.
         return not reports_state and self._tracker.is_last_item_reached
+
+    @property
+    def _has_disarmed_after_return(self) -> bool:
+        # When ArduPlane disarms, it makes the first item the current one (AP_Arming_Plane.cpp, disarm).
+        has_begun_return = self._return_began_at is not None
+        return has_begun_return and self._session.telemetry.is_confirmed_disarmed and self._is_in_landing_mode
 
     def _is_completion_final(self) -> bool:
         """Return True if a complete mission needs no further return or landing."""
@@ -218,6 +232,8 @@ class MissionEndDetector:
         home = session.telemetry.home.latest
         if home is None:
             return False
+        if len(self._return_modes) > 1:  # Near home, the vehicle may still change to a return mode that lands.
+            return self._circle.circles(home.position)
         return self._vehicle_context.vehicle_position.is_at(home.position, self._circle)
 
     @property
@@ -433,10 +449,9 @@ class MissionControl(VehiclePlan["Mission"]):
         session = self._vehicle_context.session
         if self._order is None or self._vehicle_context.arbiter.newest is not self._order or self._is_paused:
             return False
-        final_modes = [
-            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
-            for purpose in ("hold", "return", "land")
-        ]
+        autopilot, is_vtol = session.autopilot, session.telemetry.is_vtol
+        hold_and_land = [autopilot.mode_for(purpose, is_vtol=is_vtol) for purpose in ("hold", "land")]
+        final_modes = (*hold_and_land, *autopilot.return_modes(is_vtol=is_vtol))
         is_at_end = self._tracker.is_complete or self._tracker.is_at_last_item
         return is_at_end and session.telemetry.mode.latest in final_modes
 
