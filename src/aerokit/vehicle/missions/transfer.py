@@ -604,7 +604,13 @@ class PlanTransfer(Generic[PlanT]):
         return is_reported
 
     async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
-        self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
+        try:
+            received = await self._read(method)
+        except RemoteProtocolError as error:
+            # The plan has changed during the read: ArduPilot has erased a small fence, or another station has sent a
+            # plan. The file then has blocks of two plans.
+            raise self._mismatch((str(error),)) from error
+        self._compare(dict(enumerate(items)), dict(enumerate(received)))
 
     def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:
         """Raise VerificationFailed if the items differ. Both mappings are keyed by seq."""
