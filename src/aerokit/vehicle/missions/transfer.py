@@ -531,8 +531,11 @@ class PlanTransfer(Generic[PlanT]):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
-        with self._describe_file_timeout(method, "; the vehicle still has its previous items"):
-            await self._read(method)  # Another station may have changed the plan.
+        try:
+            with self._describe_file_timeout(method, "; the vehicle still has its previous items"):
+                await self._read(method)  # Another station may have changed the plan.
+        except RemoteProtocolError:  # Another station has changed it during the read; see `_verify`.
+            return False
         changed_seqs = self._changed_seqs(items)
         if changed_seqs == []:  # The vehicle has these items already.
             return True
