@@ -363,6 +363,8 @@ class ArduRover(ArduPilot):
 
     firmware = "Rover"
     has_vtols = False
+    # MISSION_START only changes the mode (GCS_MAVLink_Rover.cpp).
+    restarts_mission_by_reset = True
     is_surface_vehicle = True
     modes: ModeTable = ROVER
     purposes: ClassVar[Mapping[str, str]] = {
@@ -391,6 +393,8 @@ class ArduSub(ArduPilot):
 
     firmware = "ArduSub"
     has_vtols = False
+    # MISSION_START only changes the mode (GCS_MAVLink_Sub.cpp).
+    restarts_mission_by_reset = True
     modes: ModeTable = SUB
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "POSHOLD",

@@ -248,6 +248,10 @@ class Autopilot:
     """True if no fence is reported until the autopilot has started, even if it has stored one."""
     erases_small_fences = False
     """True if a new fence of one or two circles may be erased just after its upload."""
+    restarts_mission_by_reset = False
+    """True if MISSION_START has no effect in the mission mode. A mission that has ended or was replaced then starts
+    only by a reset: param2 of DO_SET_MISSION_CURRENT.
+    """
     mission_completes_at_home = False
     """Time at which a mission that ends with a return is reported as complete.
 

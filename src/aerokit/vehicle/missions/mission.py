@@ -378,11 +378,24 @@ class MissionControl(VehiclePlan["Mission"]):
         self._order = order
         self._tracker.start()
         with vehicle_context.flight_cleanup.holding_if_abandoned(order):
+            needs_reset = self._session.autopilot.restarts_mission_by_reset and self._tracker.is_in_mission_mode
+            if first_item is None and needs_reset:
+                first_item = await self._item_to_restart_from()
             if first_item is not None:
-                await self._set_current(first_item, timeout, order, keeps_jump_counts=False)
+                await self._set_current(first_item, timeout, order, keeps_jump_counts=False, restarts=needs_reset)
             await self._enter_mode(mode, order, timeout)
         if self._order is order:  # False if another task has paused the mission since.
             self._is_paused = False
+
+    async def _item_to_restart_from(self) -> int | None:
+        """Return the item from which a mission continues that does not run in its mode; None if it runs."""
+        progress, since = self._tracker.progress, self._session.connection.now()
+        with self._session.streaming("mission_current"), anyio.move_on_after(END_GRACE_S):
+            await progress.wait_until(lambda _: progress.updated_at > since)
+        state = None if progress.latest is None else progress.latest.state
+        if state == MissionState.COMPLETE:
+            return 0  # ArduPilot resumes a complete mission from its beginning.
+        return self._tracker.current.latest or 0 if state == MissionState.NOT_STARTED else None
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end.
@@ -471,14 +484,16 @@ class MissionControl(VehiclePlan["Mission"]):
         if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last:
             raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
 
-    async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
+    async def _set_current(
+        self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True, restarts: bool = False
+    ) -> None:
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
             # With 0, which is home, ArduPilot begins with the first item and also resets its jump counts.
             number = 0 if item == 0 and not keeps_jump_counts else seq
             try:
-                await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)
+                await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number, float(restarts))
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:
                     raise
