@@ -112,6 +112,22 @@ def test_mode_for_purpose(kind: str, purpose: Purpose, is_vtol: bool, name: str 
     assert (mode.name if mode else None) == name
 
 
+@pytest.mark.parametrize(
+    ("kind", "is_vtol", "modes"),
+    [
+        ("copter", True, {"RTL": True}),
+        ("plane", False, {"RTL": False}),
+        ("plane", True, {"QRTL": True, "RTL": False}),
+        ("quadplane", False, {"QRTL": True, "RTL": False}),
+        ("rover", False, {"RTL": False}),
+        ("sub", False, {}),
+    ],
+)
+def test_return_modes_and_which_of_them_land(kind: str, is_vtol: bool, modes: dict[str, bool]) -> None:
+    autopilot = ardupilot(kind)
+    assert {mode.name: autopilot.lands_at_home(mode) for mode in autopilot.return_modes(is_vtol=is_vtol)} == modes
+
+
 @pytest.mark.parametrize("alias", ["AUTO.LOITER", "hold", "Auto Loiter"])
 def test_px4_aliases(alias: str) -> None:
     assert px4.find_mode(alias).name == "LOITER"

@@ -20,7 +20,7 @@ from aerokit.autopilots.base import (
     TakeOff,
 )
 from aerokit.autopilots.external import ARDUPILOT_EXTERNAL, ExternalRules
-from aerokit.autopilots.modes import ModeTable
+from aerokit.autopilots.modes import Mode, ModeTable
 from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType, SpeedType
 
@@ -327,6 +327,14 @@ class ArduPlane(ArduPilot):
             return _QUADPLANE[purpose]
         return super()._purpose_name(purpose, is_vtol)
 
+    def return_modes(self, *, is_vtol: bool = False) -> tuple[Mode, ...]:
+        # At the end of a mission, a QuadPlane returns in RTL as well, which Q_RTL_MODE may change to QRTL at home.
+        names = ("QRTL", "RTL") if self._can_hover(is_vtol) else ("RTL",)
+        return tuple(self.modes.find(name) for name in names)
+
+    def lands_at_home(self, return_mode: Mode) -> bool:
+        return return_mode.name == "QRTL"
+
     def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
         # A QuadPlane climbs in GUIDED. A plane armed in TAKEOFF climbs to its parameter TKOFF_ALT.
         if self._can_hover(is_vtol):
@@ -355,6 +363,8 @@ class ArduRover(ArduPilot):
 
     firmware = "Rover"
     has_vtols = False
+    # MISSION_START only changes the mode (GCS_MAVLink_Rover.cpp).
+    restarts_mission_by_reset = True
     is_surface_vehicle = True
     modes: ModeTable = ROVER
     purposes: ClassVar[Mapping[str, str]] = {
@@ -383,6 +393,8 @@ class ArduSub(ArduPilot):
 
     firmware = "ArduSub"
     has_vtols = False
+    # MISSION_START only changes the mode (GCS_MAVLink_Sub.cpp).
+    restarts_mission_by_reset = True
     modes: ModeTable = SUB
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "POSHOLD",

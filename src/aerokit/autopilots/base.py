@@ -222,7 +222,7 @@ class Autopilot:
     reposition_purpose: Purpose = "setpoint"
     """Purpose of the mode that DO_REPOSITION changes to."""
     lands_after_return = False
-    """True if the return mode ends with a landing."""
+    """True if the return mode ends with a landing. Depends on the mode if `lands_at_home` is overridden."""
     arrival_radius_m: float = 2.0
     """Default distance in metres within which the vehicle counts as arrived.
 
@@ -248,6 +248,10 @@ class Autopilot:
     """True if no fence is reported until the autopilot has started, even if it has stored one."""
     erases_small_fences = False
     """True if a new fence of one or two circles may be erased just after its upload."""
+    restarts_mission_by_reset = False
+    """True if MISSION_START has no effect in the mission mode. A mission that has ended or was replaced then starts
+    only by a reset: param2 of DO_SET_MISSION_CURRENT.
+    """
     mission_completes_at_home = False
     """Time at which a mission that ends with a return is reported as complete.
 
@@ -359,6 +363,15 @@ class Autopilot:
         """
         name = self._purpose_name(purpose, is_vtol)
         return None if name is None else self.modes.find(name)
+
+    def return_modes(self, *, is_vtol: bool = False) -> tuple[Mode, ...]:
+        """Return the modes in which the vehicle may return, also by itself: at the end of a mission."""
+        mode = self.mode_for("return", is_vtol=is_vtol)
+        return () if mode is None else (mode,)
+
+    def lands_at_home(self, return_mode: Mode) -> bool:
+        """Return True if a return in this mode ends with a landing."""
+        return self.lands_after_return
 
     def mode_order(self, mode: Mode) -> ModeOrder:
         """Return the command that changes to a mode."""

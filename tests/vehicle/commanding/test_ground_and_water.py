@@ -212,6 +212,37 @@ async def test_rover_mission_with_return_ends_at_home() -> None:
         assert home.distance_to(vehicle.position.value) <= vehicle.autopilot.arrival_radius_m
 
 
+async def test_rover_mission_starts_again_in_its_mode() -> None:
+    """After a mission, a rover stays in AUTO, where MISSION_START has no effect."""
+    async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
+        home = vehicle.home.value.position
+        away, back = (waypoint(home.offset(north_m=north_m), altitude_relative_m=0) for north_m in (20, 0))
+        await vehicle.mission.upload(Mission([away]))
+        await vehicle.mission.start()
+        await vehicle.mission.wait_finished(timeout=60)
+        assert vehicle.mode_name == "AUTO"
+        await vehicle.mission.upload(Mission([back]))
+        await vehicle.mission.start()
+        await vehicle.mission.wait_finished(timeout=60)
+        assert home.distance_to(vehicle.position.value) < 5
+
+
+async def test_rover_mission_is_resumed_in_its_mode() -> None:
+    async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
+        home = vehicle.home.value.position
+        places = [home.offset(north_m=north_m) for north_m in (10, 20, 30)]
+        await vehicle.mission.upload(Mission([waypoint(place, altitude_relative_m=0) for place in places]))
+        await vehicle.mission.start()
+        await vehicle.mission.resume()  # The mission is running: nothing changes.
+        await vehicle.mission.wait_finished(timeout=60)
+        await vehicle.mission.set_current(1)
+        await vehicle.mission.resume()
+        await vehicle.position.wait_until(lambda place: places[1].distance_to(place) < 5, timeout=30)
+        await vehicle.mission.wait_finished(timeout=60)
+        await vehicle.mission.resume()
+        await vehicle.position.wait_until(lambda place: places[0].distance_to(place) < 5, timeout=60)
+
+
 @pytest.mark.exhaustive
 async def test_px4_plane_mission_with_return_ends_above_home() -> None:
     await anyio.sleep(1000.0)  # a loop's clock may start at any value

@@ -75,7 +75,7 @@ async def test_ardupilot_counts_an_extra_circle() -> None:
 
 @pytest.mark.parametrize("method", ["auto", "items"])
 @pytest.mark.parametrize("verify", [True, False])
-@pytest.mark.parametrize("latency_s", [0.0, 0.2])
+@pytest.mark.parametrize("latency_s", [0.0, 0.03, 0.2])  # With 0.03 s, the fence is erased while it is read back.
 async def test_small_fence_after_larger_one_remains(method: Any, verify: bool, latency_s: float) -> None:
     """ArduCopter erases a fence of one or two circles that replaces a larger one, just after it has confirmed it."""
     circle = Fence(circles=[FenceCircle(place(0, 0), 100.0)])

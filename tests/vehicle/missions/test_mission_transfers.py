@@ -230,6 +230,22 @@ async def test_file_replaced_by_another_station_during_read_is_read_again(
         assert downloaded[index].z == 33.0
 
 
+@pytest.mark.parametrize(("replaced_after_s", "is_sent"), [(0.4, True), (1.2, False)])
+async def test_plan_shortened_during_read_of_upload(replaced_after_s: float, is_sent: bool) -> None:
+    """Another station, over a link of its own, shortens the plan while it is read before or after the new items."""
+    async with open_flight(latency_s=0.1) as flight:
+        mission = flight.vehicle.mission
+        await mission.upload(long_mission(60))
+        short_plan = flight.copter.missions.items(0)[:5]
+        asyncio.get_running_loop().call_later(replaced_after_s, flight.copter.missions.replace, 0, short_plan)
+        if is_sent:
+            await mission.upload(changed(long_mission(60), 3))
+            assert holds(flight, changed(long_mission(60), 3))
+        else:
+            with pytest.raises(VerificationFailed):
+                await mission.upload(changed(long_mission(60), 3))
+
+
 async def test_download_by_file_waits_for_upload_of_another_station() -> None:
     async with open_flight() as flight:
         await flight.vehicle.mission.upload(long_mission(30))

@@ -158,7 +158,8 @@ class _CommonCommands:
         result = vehicle.change_to(vehicle.auto.number)
         if result == Result.ACCEPTED:
             vehicle.auto.may_lift_off = vehicle.is_armed
-            if not vehicle.mission.is_running:
+            # Only ArduCopter starts a mission that does not run in AUTO (GCS_MAVLink_Copter.cpp).
+            if vehicle.KIND == "copter" and not vehicle.mission.is_running:
                 vehicle.mission.start_or_resume()
         return result
 

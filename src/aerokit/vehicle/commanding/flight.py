@@ -243,7 +243,7 @@ class FlightActions(VehicleBase):
         mode = self._sender.mode_for("return_to_launch", "return")
         order = self._arbiter.order(mode)
         await self._enter_landing_mode(mode, order)
-        if self.autopilot.lands_after_return:
+        if self.autopilot.lands_at_home(mode):
             await self._await_ground("return_to_launch", order, timeout, max_silence_s)
         else:
             await self._await_home(order, timeout, max_silence_s)

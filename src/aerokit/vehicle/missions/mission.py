@@ -87,10 +87,14 @@ class MissionEndDetector:
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         self._circle = CircleDetector(session)
         # Modes in which the vehicle may land. If the last item is a landing or a return, only the mode of this item.
+        autopilot, is_vtol = session.autopilot, session.telemetry.is_vtol
+        self._return_modes = autopilot.return_modes(is_vtol=is_vtol)
+        modes_of_purpose = {"return": self._return_modes, "land": (autopilot.mode_for("land", is_vtol=is_vtol),)}
         self._landing_modes = [
-            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
+            mode
             for command, purpose in LANDING_PURPOSES.items()
             if command == last_command or self._ending in (Ending.UNKNOWN, Ending.OTHER)
+            for mode in modes_of_purpose[purpose]
         ]
         # Until this time, HEARTBEAT may still report the mode before the mission.
         self._mode_grace_until = session.connection.now() + MODE_GRACE_S
@@ -111,10 +115,14 @@ class MissionEndDetector:
             return self._is_completion_final()
         # ArduPlane leaves the mission mode for the return. The mode change stops the mission, so that its completion is
         # not reported.
-        if self._ending is Ending.RETURN and self._is_landing:
-            return self._is_on_ground or self._has_returned()
+        is_returning = self._ending is Ending.RETURN and self._is_landing
+        if is_returning or self._has_disarmed_after_return:
+            has_returned, mode = self._has_returned(), self._session.telemetry.mode.latest
+            lands_at_home = mode is not None and self._session.autopilot.lands_at_home(mode)
+            return self._is_on_ground or (has_returned and not lands_at_home)
         # The mission is not complete. The vehicle may fly it once more, so earlier observations do not count.
-        self._return_began_at = None
+        if not self._is_in_landing_mode:
+            self._return_began_at = None
         self._completed_at = None
         if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
             return True
@@ -122,6 +130,12 @@ class MissionEndDetector:
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
         # A vehicle that does not report the state of its mission has ended it when it reaches the last item.
         return not reports_state and self._tracker.is_last_item_reached
+
+    @property
+    def _has_disarmed_after_return(self) -> bool:
+        # When ArduPlane disarms, it makes the first item the current one (AP_Arming_Plane.cpp, disarm).
+        has_begun_return = self._return_began_at is not None
+        return has_begun_return and self._session.telemetry.is_confirmed_disarmed and self._is_in_landing_mode
 
     def _is_completion_final(self) -> bool:
         """Return True if a complete mission needs no further return or landing."""
@@ -220,6 +234,8 @@ class MissionEndDetector:
         home = session.telemetry.home.latest
         if home is None:
             return False
+        if len(self._return_modes) > 1:  # Near home, the vehicle may still change to a return mode that lands.
+            return self._circle.circles(home.position)
         return self._vehicle_context.vehicle_position.is_at(home.position, self._circle)
 
     @property
@@ -364,11 +380,24 @@ class MissionControl(VehiclePlan["Mission"]):
         self._order = order
         self._tracker.start()
         with vehicle_context.flight_cleanup.holding_if_abandoned(order):
+            needs_reset = self._session.autopilot.restarts_mission_by_reset and self._tracker.is_in_mission_mode
+            if first_item is None and needs_reset:
+                first_item = await self._item_to_restart_from()
             if first_item is not None:
-                await self._set_current(first_item, timeout, order, keeps_jump_counts=False)
+                await self._set_current(first_item, timeout, order, keeps_jump_counts=False, restarts=needs_reset)
             await self._enter_mode(mode, order, timeout)
         if self._order is order:  # False if another task has paused the mission since.
             self._is_paused = False
+
+    async def _item_to_restart_from(self) -> int | None:
+        """Return the item from which a mission continues that does not run in its mode; None if it runs."""
+        progress, since = self._tracker.progress, self._session.connection.now()
+        with self._session.streaming("mission_current"), anyio.move_on_after(END_GRACE_S):
+            await progress.wait_until(lambda _: progress.updated_at > since)
+        state = None if progress.latest is None else progress.latest.state
+        if state == MissionState.COMPLETE:
+            return 0  # ArduPilot resumes a complete mission from its beginning.
+        return self._tracker.current.latest or 0 if state == MissionState.NOT_STARTED else None
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end.
@@ -435,10 +464,9 @@ class MissionControl(VehiclePlan["Mission"]):
         session = self._vehicle_context.session
         if self._order is None or self._vehicle_context.arbiter.newest is not self._order or self._is_paused:
             return False
-        final_modes = [
-            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
-            for purpose in ("hold", "return", "land")
-        ]
+        autopilot, is_vtol = session.autopilot, session.telemetry.is_vtol
+        hold_and_land = [autopilot.mode_for(purpose, is_vtol=is_vtol) for purpose in ("hold", "land")]
+        final_modes = (*hold_and_land, *autopilot.return_modes(is_vtol=is_vtol))
         is_at_end = self._tracker.is_complete or self._tracker.is_at_last_item
         return is_at_end and session.telemetry.mode.latest in final_modes
 
@@ -458,7 +486,9 @@ class MissionControl(VehiclePlan["Mission"]):
         if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last_item:
             raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last_item}")
 
-    async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
+    async def _set_current(
+        self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True, restarts: bool = False
+    ) -> None:
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
@@ -466,7 +496,7 @@ class MissionControl(VehiclePlan["Mission"]):
             number = 0 if item == 0 and not keeps_jump_counts else seq
             self._expect_motion(order)
             try:
-                await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number)
+                await vehicle_context.sender.send_long(order, MavCmd.DO_SET_MISSION_CURRENT, number, float(restarts))
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:
                     raise

@@ -539,8 +539,11 @@ class PlanTransfer(Generic[PlanT]):
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
-        with self._describe_file_timeout(method, "; the vehicle still has its previous items"):
-            await self._read(method)  # Another station may have changed the plan.
+        try:
+            with self._describe_file_timeout(method, "; the vehicle still has its previous items"):
+                await self._read(method)  # Another station may have changed the plan.
+        except RemoteProtocolError:  # Another station has changed it during the read; see `_verify`.
+            return False
         changed_seqs = self._changed_seqs(items)
         if changed_seqs == []:  # The vehicle has these items already.
             return True
@@ -612,7 +615,12 @@ class PlanTransfer(Generic[PlanT]):
         return is_reported
 
     async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
-        received_items = await self._read(method)
+        try:
+            received_items = await self._read(method)
+        except RemoteProtocolError as error:
+            # The plan has changed during the read: ArduPilot has erased a small fence, or another station has sent a
+            # plan. The file then has blocks of two plans.
+            raise self._mismatch((str(error),)) from error
         self._compare(dict(enumerate(items)), dict(enumerate(received_items)))
 
     def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:
