@@ -324,6 +324,35 @@ async def test_cancelled_arm_leaves_vehicle_to_newer_arm(grounded: Flight) -> No
     assert grounded.copter.is_armed
 
 
+@pytest.mark.parametrize("is_answered", [True, False])
+async def test_cancelled_arm_leaves_vehicle_to_older_arm(grounded: Flight, is_answered: bool) -> None:
+    """The newer command was just sent, or still waits for the answer to the older one."""
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    await grounded.vehicle.set_mode("GUIDED")
+    if not is_answered:
+        grounded.copter.faults.lose_ack(ARM)
+    older = asyncio.create_task(grounded.vehicle.arm())
+    newer = asyncio.create_task(grounded.vehicle.arm())
+    await anyio.sleep(0.01)
+    newer.cancel()
+    await older
+    await anyio.sleep(ARM_WATCH_S)
+    assert ordered(grounded) == ([1, 1] if is_answered else [1])
+    assert grounded.copter.is_armed
+
+
+async def test_arming_by_two_cancelled_orders_is_undone(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.lose_ack(ARM)
+    calls = [asyncio.create_task(grounded.vehicle.arm()) for _ in range(2)]
+    await anyio.sleep(0.01)
+    for call in calls:
+        call.cancel()
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1, 0]
+    assert not grounded.copter.is_armed
+
+
 async def test_abandoned_arming_before_newer_mode_is_undone(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.lose_ack(ARM)

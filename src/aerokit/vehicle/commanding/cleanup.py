@@ -313,6 +313,9 @@ ARM_WATCH_S = 15.0
 ARM_ACK_WAIT_S = 3.0
 """The COMMAND_ACK of an arm order may arrive up to this many seconds after the HEARTBEAT that reports armed."""
 
+# Poll interval in seconds while other calls of `arm` wait.
+POLL_INTERVAL_S = 0.1
+
 # Seconds to wait for the outcome of an abandoned arm order at the end of the vehicle's `async with` block.
 ARM_CLOSE_TIMEOUT_S = 1.5
 
@@ -334,18 +337,22 @@ class ArmCleanup:
         self._task = BackgroundTask(
             session, "aerokit late arming", warning_clause="while an arm command may still be executed"
         )
-        # The arm order whose effect a call waits for, and whether the vehicle was armed before it.
-        self._awaited: tuple[Order, bool] | None = None
+        # The arm orders whose effects calls wait for, oldest first, and whether the vehicle was armed before them.
+        self._awaited: list[tuple[Order, bool]] = []
+        self._succeeded_at = -math.inf  # when the last of these calls succeeded
 
     @contextmanager
     def arming(self, order: Order, was_armed: bool) -> Iterator[None]:
         """Register an arm order while a call awaits it, so that `finish` can watch it."""
-        self._awaited = order, was_armed
+        awaited = order, was_armed
+        self._awaited.append(awaited)
         try:
             yield
+            if awaited in self._awaited:
+                self._succeeded_at = self._session.connection.now()
         finally:
-            if self._awaited == (order, was_armed):
-                self._awaited = None
+            if awaited in self._awaited:  # `finish` may have removed it.
+                self._awaited.remove(awaited)
 
     def late_arming_hint(self) -> str:
         unsent = self._session.connection.unsent_bytes
@@ -392,6 +399,10 @@ class ArmCleanup:
     async def _undo_late_arming(self, order: Order, mode_when_abandoned: Mode | None) -> None:
         """Disarm the vehicle if the abandoned order has armed it."""
         was_armed_by_order = await self._was_armed_by(order, mode_when_abandoned)
+        while self._awaited:  # noqa: ASYNC110 - another call of `arm` may have armed the vehicle; a list has no event
+            await anyio.sleep(POLL_INTERVAL_S)
+        if self._succeeded_at > self._arbiter.last_disarmed_report_at:
+            return
         if not self._is_newest_arm_command(order) or self._session.telemetry.is_confirmed_disarmed:
             return
         if not was_armed_by_order:
@@ -462,6 +473,8 @@ class ArmCleanup:
 
     async def finish(self) -> None:
         """Wait briefly for the outcome of an abandoned arm order. Logs a warning if it stays unknown."""
-        if self._awaited is not None:  # A task still waits for an arm order, which is now abandoned.
-            self.watch(*self._awaited)
+        if self._awaited:  # A task still waits for an arm order, which is now abandoned.
+            newest = self._awaited[-1]
+            self._awaited.clear()
+            self.watch(*newest)
         await self._task.finish(ARM_CLOSE_TIMEOUT_S)
