@@ -199,6 +199,18 @@ async def test_order_without_link_says_that_it_was_not_sent(order: Callable[[Veh
         assert not re.search("may|nevertheless|disarms it", str(raised.value))
 
 
+async def test_replaced_order_without_link_says_that_it_was_not_sent() -> None:
+    async with cabled() as (cable, vehicle):
+        await vehicle.wait_ready()
+        cable.pull()
+        replaced = asyncio.create_task(vehicle.set_mode("GUIDED"))
+        await anyio.sleep(0.1)
+        with pytest.raises(CommandTimeout, match="was not sent"):
+            await vehicle.set_mode("LOITER")
+        with pytest.raises(OperationRejected, match="MAV_CMD_DO_SET_MODE was not sent: another order was given"):
+            await replaced
+
+
 async def test_recording_has_only_messages_that_link_accepted(tmp_path: Path) -> None:
     """A report would otherwise attribute a change of mode to an order that was not sent."""
     orders = [m.CommandLong(1, 1, MavCmd.DO_SET_MODE, 0, 1, number, 0, 0, 0, 0, 0) for number in (3, 4)]

@@ -269,6 +269,8 @@ class Autopilot:
     """True if MAV_CMD_DO_SET_MISSION_CURRENT (224) is supported."""
     repeats_item_reached = False
     """True if MISSION_ITEM_REACHED is sent repeatedly for one item."""
+    completes_mission_in_other_modes = False
+    """True if a take-off or a landing outside of the mission is also reported as the completion of the mission."""
     accepts_ftp_session_ids = False
     """True if the client chooses the number of a MAVFTP session, False if the vehicle chooses it."""
     has_upper_case_parameters = False

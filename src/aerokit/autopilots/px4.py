@@ -166,6 +166,7 @@ class Px4(Autopilot):
     reports_mission_checksum = True
     overwrites_plans_in_place: frozenset[int] = frozenset()  # PX4 writes a new plan into a second storage area.
     repeats_item_reached = True
+    completes_mission_in_other_modes = True  # takeoff.cpp and land.cpp set mission_result.finished.
     unsupported_messages: frozenset[str] = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
     )

@@ -296,6 +296,15 @@ class CommandExchange(Exchange[CommandAck]):
     def message_dropped(self) -> None:
         self._dropped_count += 1
 
+    @property
+    def error_of_ended_order(self) -> CommandTimeout | None:
+        """The error for the caller if the order has ended, so that the command is not sent again; else None."""
+        if self._order_status is None or not self._order_status.end:
+            return None
+        name, was_sent = command_name(self._message.command), self._transmitted_count > 0
+        text = f"no COMMAND_ACK for {name} yet; not sent again" if was_sent else f"{name} was not sent"
+        return CommandTimeout(f"{text}: {self._order_status.end}", was_sent=was_sent)
+
     def expire(self, now: float) -> None:
         """After the deadline, repeat the command. Fail after the last attempt, or if progress reports have stopped."""
         if self.deadline is None or now < self.deadline:

@@ -352,6 +352,18 @@ async def test_two_cancelled_arms_are_undone(grounded: Flight) -> None:
     assert not grounded.copter.is_armed
 
 
+async def test_arming_by_two_cancelled_orders_is_undone(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.lose_ack(ARM)
+    calls = [asyncio.create_task(grounded.vehicle.arm()) for _ in range(2)]
+    await anyio.sleep(0.01)
+    for call in calls:
+        call.cancel()
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1, 0]
+    assert not grounded.copter.is_armed
+
+
 async def test_abandoned_arming_before_newer_mode_is_undone(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.lose_ack(ARM)

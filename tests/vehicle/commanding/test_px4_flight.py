@@ -18,7 +18,7 @@ from aerokit.connection.cells import StateCell
 from aerokit.dronekit import flight_orders
 from aerokit.errors import CommandRejected, CommandTimeout, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.sim.px4.modes import POSITION, custom_mode
+from aerokit.sim.px4.modes import HOLD, POSITION, custom_mode
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
@@ -54,6 +54,18 @@ async def test_px4_take_off_uses_amsl_altitude_and_ends_in_loiter() -> None:
         assert not flight.wire.commands(MavCmd.DO_SET_MODE)
         assert flight.vehicle.position.value.altitude_relative_m == pytest.approx(12.0, abs=0.7)
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=10.0)
+
+
+async def test_px4_orbit_after_abandoned_mode_names_mode_of_pilot(flying: Px4Flight) -> None:
+    """The pilot chooses LOITER, in which the orbit ends, while the abandoned mode may still be reported."""
+    vehicle, px4 = flying.vehicle, flying.px4
+    with anyio.move_on_after(0.0):
+        await vehicle.set_mode("RTL")
+    orbit = asyncio.create_task(vehicle.orbit(vehicle.position.value, radius_m=10.0))
+    await vehicle.mode.wait_until(lambda mode: mode.name == "ORBIT")
+    px4.change_mode(HOLD)
+    with pytest.raises(OperationRejected, match="the mode changed to LOITER"):
+        await orbit
 
 
 def move_home_up(flight: Px4Flight, metres: float) -> None:

@@ -198,6 +198,32 @@ async def test_px4_mission_of_a_second_has_finished() -> None:
         await mission.wait_finished(timeout=30)
 
 
+@pytest.mark.parametrize("place", ["before_start", "on_the_way"])
+async def test_px4_completed_take_off_does_not_finish_mission(place: str) -> None:
+    """PX4 reports the mission as complete at the end of a take-off."""
+    async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
+        mission = flight.vehicle.mission
+        if place == "before_start":
+            await flight.vehicle.take_off(10.0)
+        else:
+            await mission.start()
+            await reaches(flight, 1)
+            flight.px4.change_mode(px4_modes.TAKEOFF)  # by a pilot
+        await mission.progress.wait_until(lambda progress: progress.state == MissionState.COMPLETE, timeout=30)
+        with pytest.raises(OperationRejected, match="is in LOITER"):
+            await mission.wait_finished(timeout=60)
+
+
+async def test_px4_mission_that_ends_with_jump_is_finished() -> None:
+    """The item before the DO_JUMP stays current."""
+    async with armed(open_px4, jump(2, repeat=1)) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=120)
+        assert mission.current.value == mission.count.value - 2
+
+
 async def test_px4_mission_of_disarmed_vehicle_is_not_started() -> None:
     """One HEARTBEAT reports the mode and the disarming, as after a landing while the program starts a mission."""
     async with armed(open_px4) as flight:

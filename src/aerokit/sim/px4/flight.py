@@ -224,6 +224,7 @@ class Px4Flight:
         target = self.target
         _, _, target_down = target
         if abs(vehicle.motion.down - target_down) < _ARRIVED_M:
+            vehicle.mission.is_finished = True  # takeoff.cpp sets mission_result.finished.
             vehicle.switch_to(modes.HOLD)  # This sets the target to the current position.
             self.target = target
 
@@ -231,6 +232,7 @@ class Px4Flight:
         """Plan a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
+        vehicle.mission.is_finished = False
         if down is None:
             # A smaller down coordinate is higher.
             _, _, home_down = vehicle.home

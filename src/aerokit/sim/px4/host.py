@@ -79,6 +79,7 @@ class Px4FlightInterface(Protocol):
 class Px4MissionInterface(Protocol):
     current: int
     is_valid: bool
+    is_finished: bool
 
     @property
     def wants_up(self) -> bool: ...

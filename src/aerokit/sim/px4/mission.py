@@ -364,6 +364,8 @@ class Px4Mission:
             self._mark_reached()
             if self._advance():
                 self._begin_item()
+        elif self._px4.mode == LAND:
+            self.is_finished = True  # land.cpp sets mission_result.finished.
 
     def _advance(self) -> bool:
         """Select the next item and return True. After the last item, finish the mission and return False."""
@@ -376,7 +378,10 @@ class Px4Mission:
     def _finish(self) -> None:
         px4 = self._px4
         self.is_finished = self._needs_selection = True
-        self.current = max(0, min(self.current, self.count - 1))  # After the last item, that item stays current.
+        # After the last item, that item stays current. A DO_JUMP is never current (mission_base.cpp, getNonJumpItem).
+        self.current = max(0, min(self.current, self.count - 1))
+        while self.current > 0 and self._px4.missions.commands[self.current].command == Cmd.DO_JUMP:
+            self.current -= 1
         if px4.is_landed:
             px4.info("Mission finished, landed")
             return

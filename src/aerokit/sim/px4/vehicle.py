@@ -161,6 +161,7 @@ class Px4PlaneFlight(Px4Flight):
         if self._motion.down > target_down:
             return
         place = (self._motion.north, self._motion.east, target_down)
+        self._vehicle.mission.is_finished = True  # takeoff.cpp sets mission_result.finished.
         self._vehicle.switch_to(modes.HOLD)  # This sets the target to the current altitude.
         self.target = place
 

@@ -385,25 +385,27 @@ class OrderSender:
         describe_impact = self.impact_failure(order)
         grace_until = self._session.connection.now() + MODE_GRACE_S
         settles_at = max(order.settles_at, self._arbiter.mode_settles_at)
-        was_in_mode = False
+        was_reported = was_in_mode = False
 
         def failure_reason() -> str | None:
-            nonlocal was_in_mode
+            nonlocal was_reported, was_in_mode
             reason = describe_impact() or order.end
             if reason:
                 return reason
             if self._session.telemetry.is_confirmed_disarmed:
                 return "the vehicle disarmed"
+            mode = self._session.telemetry.mode.latest
+            was_reported = was_reported or mode in modes
             if self._session.connection.now() < settles_at:  # The mode of an abandoned order may still be reported.
                 return None
-            mode = self._session.telemetry.mode.latest
             if mode in modes:
                 was_in_mode = True
                 return None
             if was_in_mode:
                 return f"the mode changed to {mode}"
-            may_still_change = self._session.connection.now() <= grace_until
-            return None if may_still_change else f"the vehicle stayed in {mode}"
+            if self._session.connection.now() <= grace_until:
+                return None
+            return f"the mode changed to {mode}" if was_reported else f"the vehicle stayed in {mode}"
 
         return failure_reason
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from functools import partial
+from itertools import takewhile
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
@@ -117,13 +118,18 @@ class PlanContext:
         )
         # After a reboot, or if the reopened link leads to another vehicle, the vehicle may have other plans.
         session.on_reboot += [partial(self._forget_plan, cache) for cache in self.caches]
-        self.tracker: MissionTracker = MissionTracker(session, self._may_end_by_landing)
+        self.tracker: MissionTracker = MissionTracker(session, self._may_end_by_landing, self._count_final_jumps)
         self.caches[MavMissionType.MISSION].on_forget = self.tracker.on_plan_replaced
 
     def _may_end_by_landing(self) -> bool:
         """Return True if the last item of the mission is a landing or a return, or is unknown."""
         items = self.caches[MavMissionType.MISSION].items
         return not items or items[-1].command in LANDING_PURPOSES
+
+    def _count_final_jumps(self) -> int:
+        """Return the number of DO_JUMPs after the last other item; 0 if the items are unknown."""
+        items = self.caches[MavMissionType.MISSION].items or ()
+        return sum(1 for _ in takewhile(lambda item: item.command == MavCmd.DO_JUMP, reversed(items)))
 
     def now(self) -> float:
         return self.session.connection.now()
@@ -226,12 +232,16 @@ class MissionTracker:
 
     If the mission of an ArduCopter ends with a landing, the vehicle disarms and reports its first item as current, but
     never reports the mission as complete. PX4 reports completion until the next mission has started. PX4 also reports
-    an active mission in its landing mode, and sends each MISSION_ITEM_REACHED ten times.
+    an active mission in its modes for a take-off and a landing, and completion at their end, with the item that is
+    current then. It sends each MISSION_ITEM_REACHED ten times.
     """
 
-    def __init__(self, session: VehicleSession, may_end_by_landing: Callable[[], bool]) -> None:
+    def __init__(
+        self, session: VehicleSession, may_end_by_landing: Callable[[], bool], count_final_jumps: Callable[[], int]
+    ) -> None:
         self._session = session
         self._may_end_by_landing = may_end_by_landing
+        self._count_final_jumps = count_final_jumps
         self._source = Source(session.system_id, session.component_id, "MISSION_CURRENT")
         self._offset = int(session.autopilot.home_is_item_0)  # number of items before the program's first item
         self._repeats_item_reached = session.autopilot.repeats_item_reached  # True for PX4.
@@ -352,7 +362,7 @@ class MissionTracker:
 
     def _on_state(self, state: int) -> None:
         if state == _COMPLETE:
-            if self._session.connection.now() >= self.stale_until:
+            if self._session.connection.now() >= self.stale_until and self._may_be_complete:
                 self._complete()
             return
         self.stale_until = -math.inf
@@ -360,6 +370,14 @@ class MissionTracker:
         if is_new_flight and self.is_in_mission_mode and self._session.telemetry.is_armed:
             self._has_begun = True
             self.is_complete = self._was_replaced = False
+
+    @property
+    def _may_be_complete(self) -> bool:
+        """False if the completion that the vehicle reports is that of a take-off or a landing in another mode."""
+        current, last = self.current.latest, self.last_item
+        if not self._session.autopilot.completes_mission_in_other_modes or current is None or last is None:
+            return True
+        return current >= last - self._count_final_jumps()
 
     def _on_mode(self, *_: object) -> None:
         self._mode_changed_at = self._session.connection.now()

@@ -81,8 +81,7 @@ class CommandSender:
         self._acks_per_command = acks_per_command
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
-        # Maps each running command to the status of its order; None for a command without an order.
-        self._order_statuses: dict[_Key, OrderStatus | None] = {}
+        self._exchanges: dict[_Key, CommandExchange] = {}  # the exchanges of `_runs`
         # Maps each command to the acks of earlier calls that may still arrive, each as the time when its call ended.
         self._pending_acks: dict[_Key, list[float]] = {}
         # The last MAV_RESULT of each command, and the times at which it was last accepted and last refused.
@@ -266,26 +265,24 @@ class CommandSender:
             )
             run = ExchangeRun(self._connection, exchange)
             self._runs[key] = run
-            self._order_statuses[key] = order_status
+            self._exchanges[key] = exchange
             try:
                 return await run.result()
             except CommandTimeout as error:
                 error.args = (f"{error}; {self._describe()}",)
                 raise
             finally:
-                del self._runs[key], self._order_statuses[key]
+                del self._runs[key], self._exchanges[key]
                 # Acks arrive in the order of their commands. Those received so far answer the oldest pending commands.
                 still_pending = pending_acks[exchange.final_acks :]
                 newly_pending = [self._connection.now()] * exchange.pending_acks
                 self._add_pending_acks(key, [*still_pending, *newly_pending])
 
     def _abort_run_of_ended_order(self, key: _Key) -> None:
-        order_status = self._order_statuses.get(key)
-        if order_status is not None and order_status.end:
-            _, command = key
-            text = f"no COMMAND_ACK for {command_name(command)} yet; not sent again: {order_status.end}"
-            # The command of a newer order need not wait until this run ends.
-            self._runs[key].abort(CommandTimeout(text))
+        exchange = self._exchanges.get(key)
+        error = None if exchange is None else exchange.error_of_ended_order
+        if error is not None:  # The command of a newer order need not wait until this run ends.
+            self._runs[key].abort(error)
 
     def _min_attempt_timeout_s(self) -> float:
         # A round trip that was measured while the link was stalled would make the wait too long.
