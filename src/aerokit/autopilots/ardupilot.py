@@ -336,12 +336,14 @@ class ArduPlane(ArduPilot):
         return return_mode.name == "QRTL"
 
     def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
-        # A QuadPlane climbs in GUIDED. A plane armed in TAKEOFF climbs to its parameter TKOFF_ALT.
+        # A QuadPlane climbs in GUIDED, a plane in TAKEOFF, to its parameter TKOFF_ALT. Both stay there. The hold mode
+        # LOITER flies forward at the present height: after a hold at 1 m, both hit the ground (4.7, SITL).
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
             guided = self.modes.find("GUIDED")
-            return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None)
-        return TakeOff(mode=self.modes.find("TAKEOFF"), command=None, params=(), mode_after=None)
+            return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None, must_complete=True)
+        take_off = self.modes.find("TAKEOFF")
+        return TakeOff(mode=take_off, command=None, params=(), mode_after=None, must_complete=True)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         return _landed_state(heartbeat)

@@ -79,6 +79,8 @@ class TakeOff(Snapshot):
     command: int | None
     params: tuple[float, ...]
     mode_after: Mode | None
+    must_complete: bool = False
+    """True if a vehicle that already moves must complete the take-off, because a hold could make it hit the ground."""
 
 
 class SetpointRules(Snapshot):

@@ -279,3 +279,22 @@ async def test_arduplane_mission_with_return_ends_above_home() -> None:
         assert vehicle.mode_name == "RTL"
         assert home.distance_to(vehicle.position.value) < 150
         assert vehicle.is_armed
+
+
+@pytest.mark.parametrize(("after_s", "mode"), [(0.0, "LOITER"), (4.0, "TAKEOFF")])
+async def test_arduplane_completes_cancelled_take_off_if_it_moves(after_s: float, mode: str) -> None:
+    """A plane that has just lifted off hits the ground in LOITER, the hold mode. TAKEOFF ends in a circle as well."""
+    plane = SimulatedPlane(boot_time_s=1.0)
+    async with simulated_link(plane) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.position.wait_until(lambda _: True)
+        await vehicle.arm()
+        with anyio.move_on_after(10.0) as scope:
+            task = asyncio.create_task(vehicle.take_off(50))
+            await vehicle.mode.wait_until(lambda reported: reported.name == "TAKEOFF")
+            await anyio.sleep(after_s)
+            task.cancel()
+        assert not scope.cancelled_caught
+        await anyio.sleep(30.0)
+        assert vehicle.mode_name == mode
+        assert plane.is_landed is (mode == "LOITER")

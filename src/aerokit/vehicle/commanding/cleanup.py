@@ -22,6 +22,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags
 from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S, MODE_GRACE_S, STEERING, was_armed_by_order
+from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -107,6 +108,9 @@ MAX_HOLD_ATTEMPTS = 3
 # slow link, it is repeated later and less often.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
+# A vehicle that is higher or faster has begun its take-off.
+MAX_GROUND_HEIGHT_M, MAX_GROUND_SPEED_M_S = 0.5, 1.0
+
 # -1 and 0 leave the speed and the radius of a circle to the vehicle. NaN means the present position, so the vehicle
 # brakes and does not fly back to a point that it has passed.
 STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(math.nan,) * 4)
@@ -174,8 +178,8 @@ class FlightCleanup:
         """Order a hold because ``order`` was abandoned. Never waits, so that cancelled calls can use it.
 
         Returns True if the hold was sent, or is sent by a background task after the next HEARTBEAT. The task repeats
-        the hold if it is not confirmed. Returns False if ``order`` has ended or cannot have moved the vehicle, if the
-        vehicle is disarmed or has no hold mode, or if its session has ended.
+        the hold if it is not confirmed. Returns False if ``order`` has ended, cannot have moved the vehicle or must be
+        completed, if the vehicle is disarmed or has no hold mode, or if its session has ended.
         """
         if not order.may_move:
             return False
@@ -185,6 +189,9 @@ class FlightCleanup:
         if mode is None or session.end.error is not None:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:
+            return False
+        if order.must_complete and not order.impact and not self._stands_still():
+            logger.warning("a take-off was abandoned; the vehicle completes it, because a hold could make it descend")
             return False
         # If `only_stops` is True, `stop_in` has probably sent the hold already. It is then repeated after a HEARTBEAT.
         can_send_now = self._arbiter.is_state_recent and not order.only_stops
@@ -200,6 +207,17 @@ class FlightCleanup:
             partial(self._complete_hold, mode, order, is_sent=can_send_now, is_ack_ambiguous=is_ack_ambiguous)
         )
         return True
+
+    def _stands_still(self) -> bool:
+        """Return True if recent telemetry shows that the vehicle stands on the ground."""
+        telemetry = self._session.telemetry
+        velocity, position = telemetry.velocity, telemetry.position
+        if velocity.latest is None or position.latest is None or max(velocity.age, position.age) > POSITION_MAX_AGE_S:
+            return False
+        height_m = position.latest.altitude_relative_m
+        is_low = height_m is not None and height_m < MAX_GROUND_HEIGHT_M
+        speed_m_s = math.hypot(velocity.latest.north_m_s, velocity.latest.east_m_s, velocity.latest.down_m_s)
+        return is_low and speed_m_s < MAX_GROUND_SPEED_M_S
 
     async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool, is_ack_ambiguous: bool) -> None:
         """Wait for the confirmation of a hold. Without one, send it again after the next HEARTBEAT.

@@ -60,7 +60,8 @@ class FlightActions(VehicleBase):
         """Take off and climb to ``altitude_m`` above home. Returns when the vehicle is at that altitude.
 
         The vehicle must be armed. If the autopilot requires another mode for a take-off, aerokit changes the mode.
-        After a cancellation or a time-out, aerokit orders the vehicle to hold where it is.
+        After a cancellation or a time-out, aerokit orders the vehicle to hold where it is. An ArduPlane that already
+        moves completes its take-off instead.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
@@ -93,6 +94,7 @@ class FlightActions(VehicleBase):
         take_off_mode = self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol)
         modes = (plan.mode, plan.mode_after, take_off_mode)
         order = self._arbiter.order(*(mode for mode in modes if mode is not None))
+        order.must_complete = plan.must_complete
         try:
             with self._flight_cleanup.holding_if_abandoned(order):
                 await self._begin_take_off(plan, order)

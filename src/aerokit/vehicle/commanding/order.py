@@ -164,6 +164,8 @@ class Order:
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
         self.may_move: bool = False
         """True once this or an earlier order may move the vehicle, which must hold if this order is abandoned."""
+        self.must_complete: bool = False
+        """True if the vehicle must complete the order once it moves, because a hold could make it hit the ground."""
         self.command_ended_at: float = -math.inf
         """Time at which the wait for the answer to the order's last command ended."""
         self.was_refused: bool = False
