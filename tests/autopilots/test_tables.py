@@ -131,7 +131,7 @@ def test_take_off_parameters_have_only_altitude() -> None:
         plan = of(3, vehicle_type).take_off(7.0, None, is_vtol=False)
         assert plan is not None
         assert plan.params == (0, 0, 0, 0, 0, 0, 7.0)
-        assert plan.must_complete is (vehicle_type == 20)  # a QuadPlane, whose hold mode flies forward
+        assert plan.must_complete == (vehicle_type == 20)  # a QuadPlane, whose hold mode flies forward
     plan = of(12, 2).take_off(7.0, 500.0, is_vtol=False)
     assert plan is not None
     assert [param for param in plan.params if not math.isnan(param)] == [0, 0, 507.0]

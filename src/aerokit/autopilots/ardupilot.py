@@ -316,9 +316,9 @@ class ArduPlane(ArduPilot):
     speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
     arrival_radius_m: float = 90.0  # A plane circles with WP_LOITER_RAD, 60 m by default.
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = "reposition"
-    # Armed in TAKEOFF, a plane starts its motor by itself (takeoff.cpp, auto_takeoff_check). It stays in this mode when
-    # it disarms. AUTO is not listed: ArduPlane never changes to AUTO by itself.
-    modes_starting_flight: frozenset[str] = frozenset(("TAKEOFF",))
+    # Armed in TAKEOFF or AUTO, a plane starts its motor by itself (takeoff.cpp, auto_takeoff_check). It stays in this
+    # mode when it disarms. With FS_LONG_ACTN 4, a failsafe on the ground changes to AUTO (events.cpp).
+    modes_starting_flight: frozenset[str] = frozenset(("AUTO", "TAKEOFF"))
     arming_mode: ClassVar[str | None] = "FBWA"
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 

@@ -281,17 +281,19 @@ async def test_plane_in_autoland_arms_in_passive_mode() -> None:
         assert vehicle.is_armed
 
 
-@pytest.mark.parametrize(("is_ordered", "mode"), [(False, "FBWA"), (True, "TAKEOFF")])
-async def test_plane_keeps_take_off_mode_only_if_ordered(is_ordered: bool, mode: str) -> None:
+@pytest.mark.parametrize("is_ordered", [False, True])
+@pytest.mark.parametrize("flight_mode", ["TAKEOFF", "AUTO"])
+async def test_plane_keeps_mode_that_starts_flight_only_if_ordered(is_ordered: bool, flight_mode: str) -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with simulated_link(plane) as link, connect(link) as vehicle:
         await vehicle.wait_ready()
-        plane.set_mode(PlaneMode.TAKEOFF)
-        await vehicle.mode.wait_until(lambda mode: mode.name == "TAKEOFF")
+        await vehicle.mission.upload(missions.Mission([missions.take_off(50)]))
+        plane.set_mode(PlaneMode[flight_mode])
+        await vehicle.mode.wait_until(lambda mode: mode.name == flight_mode)
         if is_ordered:
-            await vehicle.set_mode("TAKEOFF")
+            await vehicle.set_mode(flight_mode)
         await vehicle.arm()
-        assert vehicle.mode_name == mode
+        assert vehicle.mode_name == (flight_mode if is_ordered else "FBWA")
         assert vehicle.is_armed
 
 
