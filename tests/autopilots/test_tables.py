@@ -131,11 +131,18 @@ def test_take_off_parameters_have_only_altitude() -> None:
         plan = of(3, vehicle_type).take_off(7.0, None, is_vtol=False)
         assert plan is not None
         assert plan.params == (0, 0, 0, 0, 0, 0, 7.0)
-        assert plan.must_complete == (vehicle_type == 20)  # a QuadPlane, whose hold mode flies forward
     plan = of(12, 2).take_off(7.0, 500.0, is_vtol=False)
     assert plan is not None
     assert [param for param in plan.params if not math.isnan(param)] == [0, 0, 507.0]
     assert [place for place, param in enumerate(plan.params) if math.isnan(param)] == [0, 3, 4, 5]
+
+
+def test_only_plane_must_complete_take_off() -> None:
+    """The hold mode of a QuadPlane flies forward, too."""
+    for vehicle_type, must_complete in ((2, False), (1, True), (20, True)):
+        plan = of(3, vehicle_type).take_off(7.0, None, is_vtol=False)
+        assert plan is not None
+        assert plan.must_complete is must_complete
 
 
 @pytest.mark.parametrize(
