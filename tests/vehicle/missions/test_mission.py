@@ -215,10 +215,16 @@ async def test_px4_completed_take_off_does_not_finish_mission(place: str) -> Non
             await mission.wait_finished(timeout=60)
 
 
-async def test_px4_mission_that_ends_with_jump_is_finished() -> None:
+@pytest.mark.parametrize("are_items_known", [True, False])
+async def test_px4_mission_that_ends_with_jump_is_finished(are_items_known: bool) -> None:
     """The item before the DO_JUMP stays current."""
     async with armed(open_px4, jump(2, repeat=1)) as flight:
+        assert isinstance(flight, Px4Flight)
         mission = flight.vehicle.mission
+        if not are_items_known:  # Another station replaces the mission.
+            first, *others = flight.px4.missions.lists[0]
+            flight.px4.missions.store(0, [first.replace(param1=1.0), *others])
+            await anyio.sleep(2.0)
         await mission.start()
         await mission.wait_finished(timeout=120)
         assert mission.current.value == mission.count.value - 2

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from aerokit.autopilots.base import Autopilot
+    from aerokit.autopilots.modes import Mode
     from aerokit.mavlink.frame import Frame
     from aerokit.missions.item import MissionItem
     from aerokit.position import Position
@@ -126,9 +127,11 @@ class PlanContext:
         items = self.caches[MavMissionType.MISSION].items
         return not items or items[-1].command in LANDING_PURPOSES
 
-    def _count_final_jumps(self) -> int:
-        """Return the number of DO_JUMPs after the last other item; 0 if the items are unknown."""
-        items = self.caches[MavMissionType.MISSION].items or ()
+    def _count_final_jumps(self) -> int | None:
+        """Return the number of DO_JUMPs after the last other item; None if the items are unknown."""
+        items = self.caches[MavMissionType.MISSION].items
+        if items is None or self.may_differ(MavMissionType.MISSION, items):
+            return None
         return sum(1 for _ in takewhile(lambda item: item.command == MavCmd.DO_JUMP, reversed(items)))
 
     def now(self) -> float:
@@ -237,7 +240,10 @@ class MissionTracker:
     """
 
     def __init__(
-        self, session: VehicleSession, may_end_by_landing: Callable[[], bool], count_final_jumps: Callable[[], int]
+        self,
+        session: VehicleSession,
+        may_end_by_landing: Callable[[], bool],
+        count_final_jumps: Callable[[], int | None],
     ) -> None:
         self._session = session
         self._may_end_by_landing = may_end_by_landing
@@ -258,6 +264,7 @@ class MissionTracker:
         # True if another mission has replaced that mission, and was not flown yet.
         self._was_replaced = False
         self._mode_changed_at = -math.inf
+        self._flight_mode: Mode | None = None  # the last mode other than the one in which the vehicle holds
         self._reached_at = -math.inf
         self._last_item_current_at = -math.inf
         # True if the vehicle flies to the item in `reached` once more.
@@ -377,10 +384,16 @@ class MissionTracker:
         current, last = self.current.latest, self.last_item
         if not self._session.autopilot.completes_mission_in_other_modes or current is None or last is None:
             return True
-        return current >= last - self._count_final_jumps()
+        final_jumps = self._count_final_jumps()
+        if final_jumps is None:  # The mission may end with DO_JUMPs, so `current` does not tell.
+            autopilot = self._session.autopilot
+            return self._flight_mode not in (autopilot.mode_for("take_off"), autopilot.mode_for("land"))
+        return current >= last - final_jumps
 
-    def _on_mode(self, *_: object) -> None:
+    def _on_mode(self, _: Mode | None, mode: Mode) -> None:
         self._mode_changed_at = self._session.connection.now()
+        if mode != self._session.autopilot.mode_for("hold"):
+            self._flight_mode = mode
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
         if is_armed:
