@@ -232,7 +232,7 @@ async def test_pilot_before_first_sight_keeps_vehicle() -> None:
 
 
 @pytest.mark.parametrize("after_s", [0.0, 5.0])
-async def test_pilot_who_chooses_mode_of_abandoned_flight_before_first_sight_keeps_vehicle(after_s: float) -> None:
+async def test_pilot_in_mode_of_abandoned_flight_keeps_vehicle(after_s: float) -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         await flight.take_off()
