@@ -56,6 +56,7 @@ USED_BY_THE_LIBRARY = {
         "describe_signature_problems",
         "fail",
         "last_heartbeat_at",
+        "received_from",
         "send_as",
     }
     | {"on_end", "record", "observe_frames", "observe_sent_frames", "order_refused", "hold_back", "is_held_back"}

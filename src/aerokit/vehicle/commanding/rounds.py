@@ -236,7 +236,10 @@ class RoundFlight:
             error_class = HeartbeatTimeout if self._session.watch.is_silent else OperationRejected
             raise error_class(f"{self._operation}: {error}") from error
         if scope.cancelled_caught:
-            raise OperationTimeout(f"{self._operation}: not done within {self._limits.timeout:g} s; {self._describe()}")
+            raise OperationTimeout(
+                f"{self._operation}: not done within {self._limits.timeout:g} s; {self._describe()};"
+                f" {self._session.describe_link()}"
+            )
 
     async def _path_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathSetpoints:
         position, local_position = self._telemetry.position, self._telemetry.local_position
@@ -287,6 +290,7 @@ class RoundFlight:
             while self._count_rounds() < self._rounds - LAG_ROUNDS:
                 if self._session.connection.now() > give_up_at:
                     raise OperationTimeout(
-                        f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
+                        f"{self._operation}: the vehicle did not follow its set-points; {self._describe()};"
+                        f" {self._session.describe_link()}"
                     )
                 await stream.fly(setpoints.advance(seconds=0.0), SETPOINT_INTERVAL_S)  # the last set-point again
