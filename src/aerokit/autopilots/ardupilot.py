@@ -320,6 +320,9 @@ class ArduPlane(ArduPilot):
     # mode when it disarms. With FS_LONG_ACTN 4, a failsafe on the ground changes to AUTO (events.cpp).
     modes_starting_flight: frozenset[str] = frozenset(("AUTO", "TAKEOFF"))
     arming_mode: ClassVar[str | None] = "FBWA"
+    # The hold mode LOITER flies forward at the present height: after a hold at 1 m, a plane and a QuadPlane hit the
+    # ground (4.7, SITL).
+    must_complete_take_off = True
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
@@ -336,14 +339,13 @@ class ArduPlane(ArduPilot):
         return return_mode.name == "QRTL"
 
     def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
-        # A QuadPlane climbs in GUIDED, a plane in TAKEOFF, to its parameter TKOFF_ALT. Both stay there. The hold mode
-        # LOITER flies forward at the present height: after a hold at 1 m, both hit the ground (4.7, SITL).
+        # A QuadPlane climbs in GUIDED, a plane in TAKEOFF, to its parameter TKOFF_ALT. Both stay there.
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
             guided = self.modes.find("GUIDED")
-            return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None, must_complete=True)
+            return TakeOff(mode=guided, command=MavCmd.NAV_TAKEOFF, params=params, mode_after=None)
         take_off = self.modes.find("TAKEOFF")
-        return TakeOff(mode=take_off, command=None, params=(), mode_after=None, must_complete=True)
+        return TakeOff(mode=take_off, command=None, params=(), mode_after=None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         return _landed_state(heartbeat)

@@ -79,8 +79,6 @@ class TakeOff(Snapshot):
     command: int | None
     params: tuple[float, ...]
     mode_after: Mode | None
-    must_complete: bool = False
-    """True if a vehicle that already moves must complete the take-off, because a hold could make it hit the ground."""
 
 
 class SetpointRules(Snapshot):
@@ -250,6 +248,8 @@ class Autopilot:
     """True if no fence is reported until the autopilot has started, even if it has stored one."""
     erases_small_fences = False
     """True if a new fence of one or two circles may be erased just after its upload."""
+    must_complete_take_off = False
+    """True if a vehicle that already moves must complete its take-off, because a hold could make it hit the ground."""
     restarts_mission_by_reset = False
     """True if MISSION_START has no effect in the mission mode. A mission that has ended or was replaced then starts
     only by a reset: param2 of DO_SET_MISSION_CURRENT.

@@ -297,6 +297,24 @@ async def test_plane_keeps_mode_that_starts_flight_only_if_ordered(is_ordered: b
         assert vehicle.is_armed
 
 
+async def test_plane_whose_cancelled_arming_began_flight_continues_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A QuadPlane whose motors had started refused to disarm, and hit the ground in LOITER, the hold mode."""
+    plane = SimulatedPlane(boot_time_s=1.0)
+    async with simulated_link(plane) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.set_mode("TAKEOFF")
+        monkeypatch.setattr(plane.arming, "disarm", lambda **_: False)
+        task = asyncio.create_task(vehicle.arm())
+        await anyio.sleep(0.001)
+        task.cancel()
+        await anyio.sleep(10.0)
+        assert plane.motors.is_armed
+        assert vehicle.mode_name == "TAKEOFF"
+        assert "the vehicle continues it, because a hold could make it descend" in caplog.text
+
+
 async def test_wait_ready_names_unarmable_mode_after_the_list() -> None:
     """The mode is not missing, because arm() changes it."""
     async with open_flight() as flight:

@@ -240,10 +240,8 @@ class ArmingActions(VehicleBase):
                     add_clause(error, self._arm_cleanup.late_arming_hint())
                 elif is_watched and isinstance(error, AerokitError) and self._is_in_unordered_flight_mode():
                     mode = self.telemetry.mode_name
-                    add_clause(
-                        error,
-                        f"a vehicle armed in {mode} takes off: aerokit disarms it, or orders a hold if it is flying",
-                    )
+                    if_flying = "" if self.autopilot.must_complete_take_off else ", or orders a hold if it is flying"
+                    add_clause(error, f"a vehicle armed in {mode} takes off: aerokit disarms it{if_flying}")
                 raise
 
     def _is_in_unordered_flight_mode(self) -> bool:

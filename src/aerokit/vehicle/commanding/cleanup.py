@@ -450,6 +450,13 @@ class ArmCleanup:
 
     async def _hold_after_arming(self) -> None:
         mode = self._session.telemetry.mode_name
+        if self._session.autopilot.must_complete_take_off:
+            logger.warning(
+                "the abandoned arm command has started a flight in %s: the vehicle continues it, because a hold could"
+                " make it descend",
+                mode,
+            )
+            return
         logger.warning("the abandoned arm command has started a flight in %s: aerokit orders a hold", mode)
         try:
             await self._hold()

@@ -94,7 +94,7 @@ class FlightActions(VehicleBase):
         take_off_mode = self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol)
         modes = (plan.mode, plan.mode_after, take_off_mode)
         order = self._arbiter.order(*(mode for mode in modes if mode is not None))
-        order.must_complete = plan.must_complete
+        order.must_complete = self.autopilot.must_complete_take_off
         try:
             with self._flight_cleanup.holding_if_abandoned(order):
                 await self._begin_take_off(plan, order)
