@@ -1,4 +1,4 @@
-"""A QuadPlane returns in QRTL, which lands. A mission ends in RTL, which Q_RTL_MODE may change to QRTL."""
+"""A QuadPlane completes its take-off, and returns in QRTL, which lands. Q_RTL_MODE may change RTL to QRTL."""
 
 from __future__ import annotations
 
@@ -60,6 +60,19 @@ async def flying(plane: FlyingQuadPlane) -> AsyncIterator[Vehicle]:
         there = waypoint(home.offset(north_m=300), altitude_relative_m=60)
         await vehicle.mission.upload(Mission([there, return_to_launch()]))
         yield vehicle
+
+
+async def test_cancelled_take_off_of_standing_quadplane_is_completed() -> None:
+    """In LOITER, the hold mode, it lifts off as well, and flies forward near the ground."""
+    plane = FlyingQuadPlane(boot_time_s=1.0)
+    async with simulated_link(plane) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.arm()
+        task = asyncio.create_task(vehicle.take_off(20))
+        await vehicle.mode.wait_until(lambda mode: mode.name == "GUIDED")
+        task.cancel()
+        await asyncio.sleep(5.0)
+        assert vehicle.mode_name == "GUIDED"
 
 
 def distance_from_home_m(vehicle: Vehicle) -> float:

@@ -190,7 +190,9 @@ class FlightCleanup:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:
             return False
-        if order.must_complete and not order.impact and not self._stands_still():
+        # A QuadPlane with a take-off command lifts off in LOITER, too, and flies forward (SITL 4.7).
+        has_begun = session.telemetry.is_vtol or not self._stands_still()
+        if order.must_complete and not order.impact and has_begun:
             logger.warning("a take-off was abandoned; the vehicle completes it, because a hold could make it descend")
             return False
         # If `only_stops` is True, `stop_in` has probably sent the hold already. It is then repeated after a HEARTBEAT.
