@@ -60,8 +60,8 @@ class FlightActions(VehicleBase):
         """Take off and climb to ``altitude_m`` above home. Returns when the vehicle is at that altitude.
 
         The vehicle must be armed. If the autopilot requires another mode for a take-off, aerokit changes the mode.
-        After a cancellation or a time-out, aerokit orders the vehicle to hold where it is. An ArduPlane that already
-        moves completes its take-off instead.
+        After a cancellation or a time-out, aerokit orders the vehicle to hold where it is. A QuadPlane, and an
+        ArduPlane that already moves, complete the take-off instead, because a hold could make them hit the ground.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
