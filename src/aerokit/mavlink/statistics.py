@@ -106,8 +106,8 @@ class SourceStatistics(SourceFields):
         if self.expected != self._last_expected:
             self._last_expected, self._advanced_at = self.expected, now
         ahead = (sequence - self.expected) & 0xFF
-        # After 256 frames, the current stream comes by the place where the other one has stopped. A frame that follows
-        # the current stream after a small gap belongs to it.
+        # Sequence numbers wrap, so the current stream reaches the number at which the other stream has stopped. A frame
+        # that follows the current stream after a small gap belongs to the current stream.
         follows_current = ahead <= _MAX_GAP
         is_near_other = self._other_expected >= 0 and (sequence - self._other_expected) & 0xFF < _MAX_STEP
         if is_near_other and not follows_current:

@@ -190,9 +190,7 @@ class FlightCleanup:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:
             return False
-        # A QuadPlane with a take-off command lifts off in LOITER, too, and flies forward (SITL 4.7).
-        has_begun = session.telemetry.is_vtol or not self._stands_still()
-        if order.must_complete and not order.impact and has_begun:
+        if order.must_complete and not order.impact and self._has_begun_take_off():
             logger.warning("a take-off was abandoned; the vehicle completes it, because a hold could make it descend")
             return False
         # If `only_stops` is True, `stop_in` has probably sent the hold already. It is then repeated after a HEARTBEAT.
@@ -210,16 +208,18 @@ class FlightCleanup:
         )
         return True
 
-    def _stands_still(self) -> bool:
-        """Return True if recent telemetry shows that the vehicle stands on the ground."""
+    def _has_begun_take_off(self) -> bool:
+        """Return False if a plane certainly still stands on the ground."""
         telemetry = self._session.telemetry
+        if telemetry.is_vtol:  # A QuadPlane with a take-off command lifts off in LOITER, too (SITL 4.7).
+            return True
         velocity, position = telemetry.velocity, telemetry.position
         if velocity.latest is None or position.latest is None or max(velocity.age, position.age) > POSITION_MAX_AGE_S:
-            return False
+            return True
         height_m = position.latest.altitude_relative_m
         is_low = height_m is not None and height_m < MAX_GROUND_HEIGHT_M
         speed_m_s = math.hypot(velocity.latest.north_m_s, velocity.latest.east_m_s, velocity.latest.down_m_s)
-        return is_low and speed_m_s < MAX_GROUND_SPEED_M_S
+        return not is_low or speed_m_s >= MAX_GROUND_SPEED_M_S
 
     async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool, is_ack_ambiguous: bool) -> None:
         """Wait for the confirmation of a hold. Without one, send it again after the next HEARTBEAT.

@@ -130,7 +130,7 @@ class PlanContext:
     def _count_final_jumps(self) -> int | None:
         """Return the number of DO_JUMPs after the last other item; None if the items are unknown."""
         items = self.caches[MavMissionType.MISSION].items
-        if items is None or self.may_differ(MavMissionType.MISSION, items):
+        if items is None or self._was_replaced(MavMissionType.MISSION):
             return None
         return sum(1 for _ in takewhile(lambda item: item.command == MavCmd.DO_JUMP, reversed(items)))
 
@@ -147,18 +147,22 @@ class PlanContext:
         known_items = cache.items
         if items is None or known_items is None or len(items) != len(known_items):
             return True
-        # Another station may have replaced the plan over a link of its own.
-        reported_id, count = self.plan_id(mission_type, cache.updated_at), self.tracker.count
-        are_ids_known = reported_id != 0 and cache.plan_id != 0
-        has_other_id = are_ids_known and reported_id != cache.plan_id
-        is_count_newer = mission_type == MavMissionType.MISSION and count.updated_at > cache.updated_at
-        has_other_count = is_count_newer and count.latest != len(items) - self.offset_of(mission_type)
-        if has_other_id or has_other_count:
+        if self._was_replaced(mission_type):
             return True
         from aerokit.missions.compare import ItemStorage, changed_items
 
         changed_seqs = changed_items(items, known_items, ItemStorage(self.autopilot.mission_storage))
         return any(seq >= self.offset_of(mission_type) for seq in changed_seqs)
+
+    def _was_replaced(self, mission_type: int) -> bool:
+        """Return True if the vehicle reports another plan than the known one, e.g. that of another station."""
+        cache = self.caches[mission_type]
+        reported_id, count = self.plan_id(mission_type, cache.updated_at), self.tracker.count
+        are_ids_known = reported_id != 0 and cache.plan_id != 0
+        has_other_id = are_ids_known and reported_id != cache.plan_id
+        is_count_newer = mission_type == MavMissionType.MISSION and count.updated_at > cache.updated_at
+        known_count = len(cache.items or ()) - self.offset_of(mission_type)
+        return has_other_id or (is_count_newer and count.latest != known_count)
 
     def _forget_plan(self, cache: PlanCache) -> None:
         cache.forget(self.now())
